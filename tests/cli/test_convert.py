@@ -241,6 +241,7 @@ def test_options_of_levels_need_levels(convert, plain, tmp_path):
 def test_tiles_are_written_and_verified(convert, plain, tmp_path):
     out = tmp_path / "tiles" / "tileset.json"
     said = convert(plain, out, "--lod-leaf", 100)
-    assert "7 tiles, " in said and "not placed on the globe" in said
+    assert "7 tiles, " in said
+    assert "not placed on the globe: the scene does not say where on earth it is" in said
     assert "PSNR" in convert(plain, out, "--verify")
     assert "a tile is a file" in convert(plain, out, "--lod-chunk", 5, code=2)

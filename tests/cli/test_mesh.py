@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ import pytest
 from gsplat_edu import write_scene
 from gsplat_edu.cli.main import main
 from gsplat_edu.io.mesh_files import MESH_FORMATS, read_mesh, write_mesh
+from gsplat_edu.io.scene import Scene
 from gsplat_edu.jobs import emitter
 from gsplat_edu.options.mesh import SUFFIXES
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.mesh import Mesh
 from splat_ball import RADIUS, ball
 
@@ -68,6 +71,30 @@ def test_the_truth_is_compared_and_a_collider_is_coarse(scene, tmp_path, capsys)
         and "degrees" in said
     )
     assert len(read_mesh(out).faces) <= 300
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.obj"])
+def test_a_mesh_keeps_the_place_on_earth_and_info_says_it(tmp_path, capsys, name):
+    place = Earth.at_place(47.0, 8.0, 400.0)
+    write_scene(tmp_path / "ball.ply", replace(Scene(ball()), unit="m", earth=place))
+    out, scene = tmp_path / name, str(tmp_path / "ball.ply")
+    assert main(["mesh", scene, str(out), "--voxel", "0.1", "--backend", "cpu"]) == 0
+    capsys.readouterr()
+    assert main(["info", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert f"mesh       {out}, " in said and " vertices\n" in said and "1 unit = 1 m" in said
+    assert re.search(
+        r"on earth   middle at (47\.0000|46\.9999)\d+, (8\.0000|7\.9999)\d+ degrees, (400|399)", said
+    )
+
+
+def test_info_of_a_damaged_mesh_names_the_fault(tmp_path, capsys):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nf 1 2 3\n")
+    assert main(["info", str(tmp_path / "a.obj")]) == 2
+    assert "line 2: the face names vertex 1" in capsys.readouterr().err
+    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n")
+    assert main(["info", str(tmp_path / "a.ply")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import sys
 import laspy
 import numpy as np
 import pye57
+import pyproj
 import pytest
 
 import gsplat_edu.cli.main as command_line
@@ -14,9 +15,11 @@ from gsplat_edu.data.capture import Cloud
 from gsplat_edu.data.point_files import read_points
 from gsplat_edu.data.points import read_points_ply, write_points_ply
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.data.scale import Scale, write_scale
 from gsplat_edu.data.visible_cloud import colored, thinned
-from gsplat_edu.data.writers import write_transforms
+from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.runs.folder import RunFolder
+from gsplat_edu.scene.earth import EARTH_CENTRED, Earth, converted
 from lab.captures.room import room_capture
 
 FAR = np.array([500_000.25, 5_400_000.5, 120.0])
@@ -208,6 +211,72 @@ def test_a_scan_in_other_coordinates_is_refused(tmp_path, capsys, capture):
     file.write(tmp_path / "map.las")
     err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las", code=2)
     assert "map.las: the photos see 0 of" in err and "middle is at (500000, 5.4e+06, 120.0" in err
+    assert err.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def placed(tmp_path):
+    """A capture of COLMAP, which may say where on earth it is, and its points."""
+    views, points, colors = procedural_capture(32, 8, splats=60)
+    write_colmap(tmp_path / "placed", views, points, colors)
+    return tmp_path / "placed", points
+
+
+def write_mapped(path, places, crs):
+    """Write a LAS that names its system."""
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = np.floor(places.min(axis=0)), np.full(3, 1e-4)
+    header.add_crs(pyproj.CRS(crs))
+    file = laspy.LasData(header)
+    file.x, file.y, file.z = places.T
+    file.write(path)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:4978"])
+def test_a_scan_in_another_reference_system_is_moved_to_a_capture_that_knows_its_place(
+    tmp_path, capsys, placed, crs
+):
+    folder, points = placed
+    earth = Earth.at_place(47.0, 15.3, 400.0)
+    places = converted(points @ earth.rows[:, :3].T + earth.rows[:, 3], EARTH_CENTRED, crs)
+    write_mapped(tmp_path / "map.las", places, crs)
+    assert read_points(tmp_path / "map.las").crs == crs
+    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las", code=2)
+    assert "map.las: the photos see 0 of" in err  # nobody knows where the capture is
+    write_scale(folder, Scale("m", "GPS", earth=earth))
+    out = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las")
+    assert f"that the photos see, moved from {crs} to the capture's coordinates" in out
+    np.testing.assert_allclose(read_points_ply(tmp_path / "run" / "points.ply").points, points, atol=2e-4)
+
+
+def test_the_system_of_a_scan_that_lies_elsewhere_is_named(tmp_path, capsys, placed):
+    folder, points = placed
+    write_scale(folder, Scale("m", "GPS", earth=Earth.at_place(47.0, 8.0, 400.0)))
+    write_mapped(tmp_path / "map.las", points + FAR, "EPSG:32633")
+    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las", code=2)
+    assert "map.las: the photos see 0 of" in err and ", moved from EPSG:32633 to the capture's" in err
+    assert err.count("\n") == 1
+
+
+def test_a_far_scan_in_the_direction_of_a_photo_is_refused(tmp_path, capsys, capture):
+    """All photos that look that way show the points, as one dot."""
+    folder, points = capture
+    views, _, _ = procedural_capture(32, 8, splats=60)
+    write_points_ply(
+        tmp_path / "p.ply", Cloud(points + 1e6 * views[1].camera.R[2], np.full(points.shape, 0.5))
+    )
+    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "p.ply", code=2)
+    assert "p.ply: the photos see 0 of" in err and err.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+def test_a_coloured_ply_elsewhere_is_refused_and_starts_no_training(tmp_path, capsys, capture):
+    folder, points = capture
+    write_points_ply(tmp_path / "p.ply", Cloud(points + FAR, np.full(points.shape, 0.5)))
+    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "p.ply", code=2)
+    assert (
+        "p.ply: the photos see 0 of" in err
+        and "bring them into the coordinates of the capture's poses" in err
+    )
     assert err.count("\n") == 1 and not (tmp_path / "run").exists()
 
 

@@ -60,7 +60,8 @@ def test_the_reference_frame_says_where_on_earth_the_scene_is(tmp_path, swap):
     path.write_text(json.dumps({**frame, "crs": {"definition": "EPSG:32633"}, "base_to_canonical": move}))
     earth = read_capture(tmp_path).scale.earth
     east, north = (4600000.0, 500000.0) if swap else (500000.0, 4600000.0)
-    assert earth.place_of((0, 0, 0)) == f"{east:.2f} east, {north:.2f} north, 100.00 up in EPSG:32633"
+    said = f"{east:.2f} east, {north:.2f} north, 100.00 up in EPSG:32633"
+    assert earth.place_of((0, 0, 0)).startswith(said)
     path.write_text(json.dumps({**frame, "crs": {"definition": "Arbitrary (m)"}, "base_to_canonical": move}))
     assert read_capture(tmp_path).scale is None
     move["scale"][1] = 0

@@ -11,7 +11,8 @@ from PIL import Image
 import tiers
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.io.mesh_files import MESH_FORMATS, mesh_format_of, mesh_losses, read_mesh, write_mesh
-from gsplat_edu.io.mesh_glb import linear
+from gsplat_edu.io.mesh_glb import linear, write_parts
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.mesh import Mesh, Texture
 
 pytestmark = pytest.mark.fuzz
@@ -125,6 +126,39 @@ def test_gltf_is_turned_and_in_metres(tmp_path):
         write_mesh(tmp_path / f"known{suffix}", mesh, "cm")
         assert np.array_equal(read_mesh(tmp_path / f"known{suffix}").vertices, mesh.vertices)
         assert np.allclose(read_mesh(tmp_path / f"known{suffix}", "m").vertices, mesh.vertices / 100)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_mesh_says_where_on_earth_it_is(tmp_path, suffix):
+    """A GLB is in metres, so that its place on earth is that of these."""
+    mesh, earth = some_mesh(), Earth.at_place(47.0, 8.0, 400.0, np.diag([0.01, 0.01, 0.01]))
+    path = tmp_path / f"a{suffix}"
+    write_mesh(path, mesh, "cm", up=(0.0, 0.0, 1.0), earth=earth)
+    found = mesh_format_of(path).read(path)
+    assert found.unit == ("m" if suffix == ".glb" else "cm")
+    for before, after in zip(mesh.vertices, found.mesh.vertices, strict=True):
+        np.testing.assert_allclose(
+            found.earth.rows @ [*after, 1], earth.rows @ [*before, 1], rtol=0, atol=1e-7
+        )
+    write_mesh(path, mesh, "cm")
+    assert mesh_format_of(path).read(path).earth is None
+
+
+def test_parts_of_a_collider_say_where_on_earth_they_are(tmp_path):
+    earth = Earth.at_place(47.0, 8.0, 400.0)
+    write_parts(tmp_path / "a.glb", [("one", some_mesh())], "m", (0.0, 0.0, 1.0), earth)
+    assert mesh_format_of("a.glb").read(tmp_path / "a.glb").earth == earth
+
+
+def test_a_damaged_place_on_earth_is_refused_in_one_line(tmp_path):
+    mesh, earth = some_mesh(), Earth.at_place(47.0, 8.0, 400.0)
+    for suffix in SUFFIXES:
+        path = tmp_path / f"a{suffix}"
+        write_mesh(path, mesh, earth=earth)
+        path.write_bytes(path.read_bytes().replace(b"EPSG:4978", b"EPSG 4978"))
+        with pytest.raises(SceneFormatError, match="place on earth") as caught:
+            read_mesh(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("count", [9, 70_000])

@@ -14,6 +14,7 @@ from PIL import Image
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.io.mesh_files import mesh_losses, read_mesh, write_mesh
 from gsplat_edu.io.mesh_glb import linear
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.mesh import Mesh, Texture
 
 Usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed")
@@ -72,6 +73,16 @@ def test_usd_reads_what_is_written(tmp_path, unit, size, extra):
         assert (np.array(shades.Get()) == linear(mesh.colors).astype(np.float32)).all()
     else:
         assert not shades.HasValue()
+
+
+def test_the_layer_says_where_on_earth_its_metres_are(tmp_path):
+    earth = Earth.at_place(47.0, 8.0, 400.0, np.diag([0.01, 0.01, 0.01]))
+    write_mesh(tmp_path / "a.usdz", some_mesh(), "cm", earth=earth)
+    stage, _ = opened(tmp_path / "a.usdz")
+    said = Earth.parsed(stage.GetRootLayer().customLayerData["gsplat_edu"]["earth"])
+    np.testing.assert_allclose(said.rows, Earth.at_place(47.0, 8.0, 400.0).rows, rtol=0, atol=1e-9)
+    write_mesh(tmp_path / "b.usdz", some_mesh(), "cm")
+    assert not opened(tmp_path / "b.usdz")[0].GetRootLayer().customLayerData
 
 
 @pytest.mark.parametrize(("jpeg", "name"), [(None, "texture.png"), (90, "texture.jpg")])

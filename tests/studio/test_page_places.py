@@ -5,12 +5,14 @@ import re
 
 import pytest
 
+from data.pose_programs import CAMERAS, write_nvm, write_opensfm
+from gsplat_edu.data.chosen_poses import CHOSEN
 from gsplat_edu.data.left_out import LEFT_OUT, read_left_out, write_left_out
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.views import View
 from studio.pages import capture_frame, go
-from waiting import resize, until_in
+from waiting import awaited, resize, until_in
 
 STYLES = "viewer.cameras.list.map((_, i) => [...viewer.cameras.styles.slice(8 * viewer.cameras.firsts[i]).slice(0, 3)])"
 """Colour of each camera's lines."""
@@ -104,3 +106,47 @@ def test_the_page_follows_the_capture(page, studio, tmp_path):
     refused = page.get("/api/captures/none/page")
     assert refused.status_code == 400
     assert "is not a capture" in refused.json()["error"]
+
+
+def test_whose_poses_are_read_is_chosen_where_several_programs_left_some(visitor, library):
+    folder = library[0].library.root / "captures" / "both"
+    write_opensfm(folder)
+    tab = go(visitor().tab, "captures/both")
+    tab.get_by_text("Poses of OpenSfM: 6 of 6 photos").wait_for()
+    select = tab.get_by_label("Cameras from")
+    assert select.is_hidden()  # there is nothing to choose
+    write_nvm(folder, CAMERAS[:4])
+    tab.reload()
+    select.wait_for()
+    assert select.input_value() == ""
+    frame = capture_frame(tab, "both")
+    until_in(tab, frame, "viewer.cameras.list.length === 6")
+    select.select_option("VisualSFM: any name.nvm")
+    tab.get_by_text("Poses of VisualSFM: 4 of 6 photos").wait_for()
+    assert (folder / CHOSEN).read_text() == "any name.nvm\n"
+    awaited(tab, lambda: capture_frame(tab, "both").evaluate("viewer.cameras.list.length") == 4)
+    tab.reload()
+    tab.get_by_label("Cameras from").wait_for()
+    assert tab.get_by_label("Cameras from").input_value() == "any name.nvm"
+
+
+def test_only_files_with_poses_can_be_chosen(page, studio):
+    folder = studio.library.root / "captures" / "both"
+    write_opensfm(folder)
+    address = "/api/captures/both/poses"
+    assert page.get(address).json() == {"files": [], "chosen": None}
+    write_nvm(folder, CAMERAS[:4])
+    files = [
+        {"file": "any name.nvm", "program": "VisualSFM"},
+        {"file": "reconstruction.json", "program": "OpenSfM"},
+    ]
+    assert page.get(address).json() == {"files": files, "chosen": None}
+    for wrong in ("images/shot_0.png", "../x", "/etc/passwd"):
+        refused = page.post(address, json={"file": wrong})
+        assert refused.status_code == 400 and "is no file with poses" in refused.json()["error"]
+    assert page.post(address, json={"file": "reconstruction.json"}).status_code == 200
+    assert page.get(address).json() == {"files": files, "chosen": "reconstruction.json"}
+    (folder / CHOSEN).write_text("gone.xml")
+    assert page.get(address).status_code == 422
+    assert page.post(address, json={"file": ""}).status_code == 200
+    assert page.get(address).json()["chosen"] is None and not (folder / CHOSEN).exists()

@@ -208,7 +208,7 @@ def _say_written(
         more = f"; mesh of {len(meshes.surface.faces):,} triangles; {path.stat().st_size:,} bytes"
     say(f"wrote {path}: {content or f'{count:,} splats, SH degree {degree}'}{more}")
     if export.has_levels(path):
-        say(export.levels_line(path))
+        say(export.levels_line(path, source.scene))
 
 
 def _measured(measure: Measure, scale: float, unit: str | None) -> str:

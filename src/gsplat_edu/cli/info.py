@@ -1,4 +1,4 @@
-"""`gsplat-edu info`: summarise a dataset, a run, a scene file or this computer on one screen."""
+"""`gsplat-edu info`: summarise a dataset, a run, a scene or mesh file, or this computer on one screen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gsplat_edu.base.constants import ALPHA_MIN
-from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, CheckpointError
+from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, CheckpointError, SceneFormatError
 from gsplat_edu.base.text import short_number
 from gsplat_edu.budget.choice import usual_choice
 from gsplat_edu.cli.terminal import Terminal
@@ -24,8 +24,17 @@ from gsplat_edu.data.scale import Scale
 from gsplat_edu.engine import adapters
 from gsplat_edu.evaluate.verdict import skipped_views
 from gsplat_edu.io import ply
-from gsplat_edu.io.formats import LOD_META, SOG_META, file_in, format_of, read_scene, stored_bytes
+from gsplat_edu.io.formats import (
+    FORMATS,
+    LOD_META,
+    SOG_META,
+    file_in,
+    format_of,
+    read_scene,
+    stored_bytes,
+)
 from gsplat_edu.io.lod.codec import read_index
+from gsplat_edu.io.mesh_files import MESH_FORMATS, mesh_format_of
 from gsplat_edu.render.backends import BACKENDS, gpu_of, unavailable
 from gsplat_edu.runs.folder import RunFolder
 from gsplat_edu.scene.frame import ORIGIN
@@ -62,10 +71,10 @@ def run(arguments: argparse.Namespace) -> None:
         return
     path: Path = arguments.path
     if not path.exists():
-        raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder or a scene file")
+        raise ArgumentError(f"{path}: does not exist; give a dataset folder, a run folder, a scene or a mesh")
     path = file_in(path)
     if path.is_file() and not _is_pose_file(path):
-        facts = _scene_facts(path)
+        facts = _file_facts(path)
     elif RunFolder(path).exists():
         facts = _run_facts(RunFolder(path))
     else:
@@ -103,6 +112,44 @@ def _usual_choice() -> str:
         return usual_choice(adapters.Listing(adapters.adapters() if reason is None else (), reason))
     except BackendUnavailableError as error:
         return f"none: {error}"
+
+
+def _file_facts(path: Path) -> list[Fact]:
+    """Describe a scene, or a mesh of one of the suffixes that both have or of its own."""
+    suffix = path.suffix.lower()
+    if suffix not in {each.suffix for each in MESH_FORMATS if each.reader}:
+        return _scene_facts(path)
+    if suffix not in {each.suffix for each in FORMATS}:
+        return _mesh_facts(path)
+    try:
+        return _scene_facts(path)
+    except SceneFormatError as error:
+        try:
+            return _mesh_facts(path)
+        except SceneFormatError:
+            raise error from None
+
+
+def _mesh_facts(path: Path) -> list[Fact]:
+    found = mesh_format_of(path)
+    stored = found.read(path)
+    mesh, texture = stored.mesh, stored.mesh.texture
+    facts = [
+        ("mesh", f"{path}, {found.name}"),
+        ("triangles", f"{len(mesh.faces):,} of {len(mesh.vertices):,} vertices"),
+        ("file", f"{path.stat().st_size:,} bytes"),
+    ]
+    if mesh.colors is not None:
+        facts.append(("colours", "of vertices"))
+    if texture is not None:
+        facts.append(("texture", "{1} x {0} px".format(*texture.image.shape)))
+    if stored.unit is not None:
+        facts.append(("units", f"1 unit = 1 {stored.unit}"))
+    if stored.earth is not None:
+        middle = np.median(mesh.vertices, axis=0)
+        facts.append(("on earth", f"middle at {stored.earth.place_of(middle)}"))
+    facts.append(("extent", _bounds(mesh.vertices)))
+    return facts
 
 
 def _scene_facts(path: Path) -> list[Fact]:

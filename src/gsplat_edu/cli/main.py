@@ -38,7 +38,7 @@ COMMANDS = {
     "leave-out": "take photos out of use in a capture, or bring them back; their files stay",
     "mask": "exclude parts of a photo by its mask, or restore the mask as it was",
     "grade": "give points for each part of an assignment of the course, and say what is wrong",
-    "info": "summarise a capture, a run, a scene file or this computer on one screen",
+    "info": "summarise a capture, a run, a scene or mesh file, or this computer on one screen",
 }
 """Commands and their summaries. Each has a module in `gsplat_edu.cli`, with `run`, and one in `gsplat_edu.options`."""
 

@@ -159,7 +159,7 @@ def _written(
     else:
         for loss in mesh_losses(arguments.out, mesh):
             console.say(loss)
-        write_mesh(arguments.out, mesh, unit, up=source.scene.up)
+        write_mesh(arguments.out, mesh, unit, up=source.scene.up, earth=source.scene.earth)
         counted = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
         volume = _volume(result, unit or "world units")
         console.say(f"wrote {arguments.out}: {counted}; {volume}")
@@ -198,7 +198,8 @@ def _volume(result: MeshResult, unit: str) -> str:
 def _write_convex(out: Path, mesh: Mesh, scene: Scene, console: Terminal) -> dict[str, Any]:
     """Write convex parts of the mesh, say how much of it they leave out, and return both for its record."""
     parts, unit = convex_parts(mesh), scene.unit
-    write_parts(out, [(f"collider_{number}", part) for number, part in enumerate(parts)], unit, scene.up)
+    named = [(f"collider_{number}", part) for number, part in enumerate(parts)]
+    write_parts(out, named, unit, scene.up, scene.earth)
     fit = fit_of(mesh, parts)
     triangles = sum(len(part.faces) for part in parts)
     counted = f"{len(parts)} convex part{'s' * (len(parts) != 1)}, {triangles:,} triangles"

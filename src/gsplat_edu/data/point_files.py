@@ -32,11 +32,13 @@ class PointFile:
         points: (N, 3) in the file's units, including NaN and infinity.
         colors: (N, 3) 0 to 1; None if the file has none.
         scan: Whether the file is of a format of scanners, and not a PLY.
+        crs: Code of the coordinate reference system that a LAS or LAZ names; None if it names none, or as words only.
     """
 
     points: Points
     colors: Points | None
     scan: bool
+    crs: str | None = None
 
     @property
     def cloud(self) -> Cloud:
@@ -64,7 +66,7 @@ def read_points(path: Path) -> PointFile:
             points, colors = read(path)
             if not len(points):
                 raise DatasetError(f"{path}: holds no points; export the scan again")
-            return PointFile(points, colors, True)
+            return PointFile(points, colors, True, _las_system(path) if read is _read_las else None)
     return PointFile(*read_ply(path), False)
 
 
@@ -86,6 +88,21 @@ def _read_las(path: Path) -> tuple[Points, Points | None]:
             raise
         raise _damaged(path, "LAS", error) from None
     return _joined(points, colors)
+
+
+def _las_system(path: Path) -> str | None:
+    """Return the code of a file's system, with that of its heights; None without one, or without pyproj to read it."""
+    with _library("laspy", path).open(path) as file:
+        try:
+            system = file.header.parse_crs()
+        except (
+            Exception
+        ):  # pyproj is not installed, or does not understand the file's text: many errors of two packages
+            return None
+    if system is None:
+        return None
+    codes = [part.to_epsg() for part in system.sub_crs_list or [system]]
+    return None if None in codes else "EPSG:" + "+".join(map(str, codes))
 
 
 def _read_e57(path: Path) -> tuple[Points, Points | None]:

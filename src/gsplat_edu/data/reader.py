@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +25,7 @@ from gsplat_edu.data.capture import (
     is_file,
     is_folder,
 )
+from gsplat_edu.data.chosen_poses import chosen_poses
 from gsplat_edu.data.colmap import PLACES, find_model, read_colmap
 from gsplat_edu.data.conventions import read_as
 from gsplat_edu.data.loading_notes import LoadingNote, MovedOrigin
@@ -117,12 +119,15 @@ class CaptureReader:
 def read_capture(path: Path) -> Capture:
     """Detect the layout of a path and read its poses and names, without photos.
 
+    Of a folder with poses of several programs, those that were chosen (`gsplat_edu.data.chosen_poses`) come first.
+
     Raises:
         DatasetError: it holds no capture, or a damaged one.
     """
     if (foreign := _plugged_reader(path)) is not None:
         reader: Reader = plugins("readers")[foreign]
         return reader.read(path)
+    path = chosen_poses(path)
     if is_file(path) and (files := pose_files(path)):
         return read_poses(path, files)
     if path.suffix.lower() == ".json" and is_file(path):
@@ -174,6 +179,8 @@ def layout_of(path: Path) -> str | None:
     """
     if (foreign := _plugged_reader(path)) is not None:
         return foreign
+    with contextlib.suppress(DatasetError):  # reading says what is wrong with the choice
+        path = chosen_poses(path)
     if is_file(path) and (files := pose_files(path)):
         return files[0].program.name
     if path.suffix.lower() == ".json" and is_file(path):

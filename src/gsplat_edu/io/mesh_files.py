@@ -12,7 +12,8 @@ from pathlib import Path
 
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import of_type
-from gsplat_edu.io.mesh_parts import METRES, StoredMesh
+from gsplat_edu.io.mesh_parts import METRES, Placement, StoredMesh
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
 
@@ -133,6 +134,7 @@ def write_mesh(
     unit: str | None = None,
     jpeg: int | None = None,
     up: Vector | None = None,
+    earth: Earth | None = None,
 ) -> None:
     """Write a mesh in the format that the file's name indicates; parent folders are created.
 
@@ -145,6 +147,7 @@ def write_mesh(
         unit: Unit of its coordinates, "m", "cm" or "mm"; None if unknown. glTF and USDZ get metres, others a comment.
         jpeg: Quality of the texture in a binary glTF or USDZ as JPEG, 1 to 95; None writes PNG, which loses nothing.
         up: The scene's up direction, which a glTF or USDZ turns to y; None if unknown. Others keep the coordinates.
+        earth: Where on earth its coordinates are, which every format states; None if unknown.
 
     Raises:
         ArgumentError: the name has no suffix of a mesh format, the mesh has no faces or does not fit into the format,
@@ -160,9 +163,9 @@ def write_mesh(
         raise ArgumentError(f"jpeg: is {jpeg}, but must be from 1 to 95")
     module = importlib.import_module(f"gsplat_edu.io.{found.writer}")
     if found.jpeg:
-        module.write(Path(path), mesh, unit, jpeg, up)
+        module.write(Path(path), mesh, Placement.of(mesh.vertices, unit, up, earth), jpeg)
     else:
-        module.write(Path(path), mesh, unit)
+        module.write(Path(path), mesh, unit, earth)
 
 
 def _check_unit(unit: str | None) -> None:

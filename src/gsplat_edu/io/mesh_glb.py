@@ -2,7 +2,8 @@
 
 glTF's y points up and its front is +z, so a mesh is converted by a half turn about x, as scenes are
 (`gsplat_edu.io.axes`): (x, y, z) becomes (x, -y, -z). glTF's unit is the metre: if the scene's unit is known,
-coordinates are converted to metres, and the asset's extras say so. Positions are float32, which is all that glTF has.
+coordinates are converted to metres, and the asset's extras say so, and where on earth these are if that is known.
+Positions are float32, which is all that glTF has.
 
 Colours of vertices (COLOR_0) are linear in glTF. They are written in 16 bits: in 8 bits, the darker sRGB values would
 become equal. A texture is an embedded PNG or JPEG, which stays sRGB. A viewer would multiply it by the vertices'
@@ -31,6 +32,7 @@ from gsplat_edu.io.axes import POSITION_SIGNS
 from gsplat_edu.io.glb_container import GENERATOR, root_node, write_container
 from gsplat_edu.io.mesh_image import encoded
 from gsplat_edu.io.mesh_parts import METRES, Placement, split_at_seams, turned_positions, vertex_normals
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import Vector
 from gsplat_edu.scene.mesh import Mesh
 
@@ -56,10 +58,9 @@ def linear(srgb: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
-def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector | None) -> None:
+def write(path: Path, mesh: Mesh, placement: Placement, jpeg: int | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     origin, faces, uvs = split_at_seams(mesh)
-    placement = Placement.of(mesh.vertices, unit, up)
     positions = turned_positions(path, mesh.vertices[origin], placement, "glTF")
     normals = vertex_normals(mesh)[origin] * np.array(POSITION_SIGNS) + 0.0
     file = _Document()
@@ -87,7 +88,11 @@ def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector
 
 
 def write_parts(
-    path: str | Path, parts: Sequence[tuple[str, Mesh]], unit: str | None = None, up: Vector | None = None
+    path: str | Path,
+    parts: Sequence[tuple[str, Mesh]],
+    unit: str | None = None,
+    up: Vector | None = None,
+    earth: Earth | None = None,
 ) -> None:
     """Write several meshes as one binary glTF, a node for each; colours and textures are not written.
 
@@ -98,6 +103,7 @@ def write_parts(
         parts: Name and mesh of each node, at least one, each with at least one face.
         unit: Unit of the coordinates, "m", "cm" or "mm", which become metres; None if unknown.
         up: Up direction of the scene, which becomes y; None if unknown.
+        earth: Where on earth the coordinates are; None if unknown.
 
     Raises:
         ArgumentError: there are no parts, one has no faces or a coordinate beyond float32, or the unit is unknown.
@@ -111,7 +117,7 @@ def write_parts(
     file = _Document()
     meshes: list[dict[str, Any]] = []
     nodes: list[dict[str, Any]] = []
-    placement = Placement.of(np.concatenate([mesh.vertices for _, mesh in parts]), unit, up)
+    placement = Placement.of(np.concatenate([mesh.vertices for _, mesh in parts]), unit, up, earth)
     for name, mesh in parts:
         attributes = {
             "POSITION": file.attribute(turned_positions(path, mesh.vertices, placement, "glTF"), bounds=True)
@@ -182,12 +188,9 @@ class _Document:
         self.document["textures"] = [{"source": 0, "sampler": 0}]
 
     def place(self, placement: Placement) -> None:
-        """State unit and up direction, by which `mesh_glb_reading` finds the mesh's own coordinates again."""
-        known: dict[str, Any] = {} if placement.unit is None else {"unit": "m"}
-        if placement.up is not None:
-            known["up"] = list(placement.up)
-        if known:
-            self.document["asset"]["extras"] = known
+        """State unit, up and place on earth, by which `mesh_glb_reading` finds the mesh's own coordinates again."""
+        if placement.stated:
+            self.document["asset"]["extras"] = placement.stated
 
     def write(self, path: Path, content: str) -> None:
         """Write the file."""

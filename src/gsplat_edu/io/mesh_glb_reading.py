@@ -16,8 +16,8 @@ from gsplat_edu.io.glb_container import GENERATOR, MISREAD, NUMBERS, GlbFile, co
 from gsplat_edu.io.mesh_glb import TRIANGLES, UNLIT
 from gsplat_edu.io.mesh_image import decoded
 from gsplat_edu.io.mesh_parts import Polygons, StoredMesh, check_vertices, distinct_rows, triangles_in
-from gsplat_edu.io.scene import read_extras
-from gsplat_edu.scene.frame import ORIGIN, Vector
+from gsplat_edu.io.scene import SceneFrame, read_extras
+from gsplat_edu.scene.frame import ORIGIN
 from gsplat_edu.scene.mesh import Mesh, Texture
 
 MOST_PARTS = 100_000
@@ -50,15 +50,15 @@ def read(path: Path) -> StoredMesh:
     try:
         file = _File(path, document, body)
         parts = list(file.parts())
-        unit, up = _frame(document["asset"])
+        frame = _frame(path, document["asset"])
     except MISREAD:
         refuse(path, "its JSON does not describe meshes as glTF does")
     if not parts:
         refuse(path, "has no mesh of triangles")
     starts = np.cumsum([0, *(len(part.points) for part in parts)])
     points = np.concatenate([part.points for part in parts])
-    if up is not None:  # the root turned up to y; the mesh gets its own coordinates back
-        points = points @ root_transform(up, ORIGIN)[0]
+    if frame.up is not None:  # the root turned up to y; the mesh gets its own coordinates back
+        points = points @ root_transform(frame.up, ORIGIN)[0]
     points = points * np.array(POSITION_SIGNS) + 0.0
     check_vertices(path, points, lambda row: f"vertex {row}")
     corners = np.concatenate([part.corners + start for part, start in zip(parts, starts[:-1], strict=True)])
@@ -68,15 +68,17 @@ def read(path: Path) -> StoredMesh:
     texture = file.texture(parts, faces)
     kept, merged = _merged(points)
     colors = None if colors is None else colors[kept]
-    return StoredMesh(Mesh(points[kept], merged[faces], colors, texture), unit)
+    return StoredMesh(Mesh(points[kept], merged[faces], colors, texture), frame.unit, frame.earth)
 
 
-def _frame(asset: dict[str, Any]) -> tuple[str | None, Vector | None]:
-    """Return the unit and the scene's up direction: metres and None, except for our files."""
+def _frame(path: Path, asset: dict[str, Any]) -> SceneFrame:
+    """Return what our files say of the coordinates; of other files, that they are metres."""
     if asset.get("generator") != GENERATOR:
-        return "m", None
-    frame = read_extras(asset.get("extras"))
-    return frame.unit, frame.up
+        return SceneFrame(unit="m")
+    try:
+        return read_extras(asset.get("extras"))
+    except ValueError:
+        refuse(path, "has an origin or a place on earth that is none")
 
 
 def _merged(points: Float64[np.ndarray, "N 3"]) -> tuple[Int64[np.ndarray, " V"], Int64[np.ndarray, " N"]]:

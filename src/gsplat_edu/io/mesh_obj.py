@@ -2,7 +2,8 @@
 
 Numbers are written with as many digits as it takes to read the same number back. Colours of vertices follow their
 coordinates, as sRGB from 0 to 1; the format never defined that, but most programs read it. Coordinates are those of the
-scene: nothing is flipped, since the format says nothing about axes. The unit is a comment that only this package reads.
+scene: nothing is flipped, since the format says nothing about axes. Unit and place on earth are comments that
+only this package reads.
 
 Of files of any program, geometry is read: faces with any number of corners, negative indices, continued lines. A
 texture is read if one image covers all faces and lies beside the file; a mesh whose images are several, elsewhere or
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 from PIL import Image
 
+from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import written_aside
 from gsplat_edu.base.ply_table import refuse_lfs_pointer
 from gsplat_edu.base.reading import read_bytes
@@ -36,6 +38,7 @@ from gsplat_edu.io.mesh_parts import (
     triangles_in,
 )
 from gsplat_edu.io.ply_comments import OURS
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import UNITS
 from gsplat_edu.scene.mesh import Mesh, Texture
 
@@ -52,7 +55,7 @@ ODD = re.compile(r"[\s#]+")
 """Characters of a file's name that would end it inside an OBJ."""
 
 
-def write(path: Path, mesh: Mesh, unit: str | None) -> None:
+def write(path: Path, mesh: Mesh, unit: str | None, earth: Earth | None) -> None:
     """Write a mesh, its material and its image; see `gsplat_edu.io.mesh_files.write_mesh`."""
     with ExitStack() as stack:  # renamed in reverse order: image and material are there once the mesh is
         aside = stack.enter_context(written_aside(path))
@@ -66,6 +69,8 @@ def write(path: Path, mesh: Mesh, unit: str | None) -> None:
             file.write("# made by gsplat-edu\n")
             if unit is not None:
                 file.write(f"# {OURS} unit {unit}\n")
+            if earth is not None:
+                file.write(f"# {OURS} earth {earth}\n")
             if mesh.texture is not None:
                 file.write(f"mtllib {material.name}\n")
             for lines in _lines(mesh):
@@ -124,7 +129,9 @@ def read(path: Path) -> StoredMesh:
     )
     triangles = triangles_in(path, points, polygons)
     texture = _texture(path, found, triangles)
-    return StoredMesh(Mesh(points, polygons.corners[triangles], _colors(found), texture), found.unit)
+    return StoredMesh(
+        Mesh(points, polygons.corners[triangles], _colors(found), texture), found.unit, found.earth
+    )
 
 
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
@@ -132,7 +139,7 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
     held: list[str] = []
     for place, line in enumerate(text.splitlines(), 1):
         words = line.split()
-        if words and words[0] == "#" and words[1:3] == [OURS, "unit"]:
+        if words and words[0] == "#" and words[1:3] in ([OURS, "unit"], [OURS, "earth"]):
             yield place, words
             continue
         words = line.split("#", 1)[0].split()
@@ -168,6 +175,7 @@ class _Lines:
         self.materials: set[str | None] = set()  # of the faces
         self.libraries: list[str] = []
         self.unit: str | None = None
+        self.earth: Earth | None = None
 
     def add(self, place: int, words: list[str]) -> None:
         """Add a statement; those that say nothing about surfaces are skipped."""
@@ -184,6 +192,11 @@ class _Lines:
                 self.libraries += names
             case ["#", _, "unit", unit] if unit in UNITS:
                 self.unit = unit
+            case ["#", _, "earth", *described]:
+                try:
+                    self.earth = Earth.parsed(" ".join(described))
+                except ArgumentError:
+                    refuse(self._path, f"line {place}: is no place on earth")
 
     def _vertex(self, place: int, numbers: list[float]) -> None:
         if len(numbers) not in (3, 4, 6, 7):  # x y z, a weight, a colour

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -14,6 +14,8 @@ from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.reading import TOO_LARGE
 from gsplat_edu.io.axes import POSITION_SIGNS, root_transform
+from gsplat_edu.io.scene import SceneFrame, extras
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import Vector, as_origin, origin_of
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.polygons import triangles_of
@@ -38,10 +40,12 @@ class StoredMesh:
     Args:
         mesh: The mesh, in this package's axes.
         unit: Unit of its coordinates, "m", "cm" or "mm"; None if the file does not say.
+        earth: Where on earth its coordinates are; None if the file does not say.
     """
 
     mesh: Mesh
     unit: str | None = None
+    earth: Earth | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,16 +229,24 @@ class Placement:
         unit: Unit of the mesh's coordinates, "m", "cm" or "mm"; None if unknown, which leaves their size.
         up: Its up direction, in this package's axes; None if unknown, which turns nothing.
         origin: Subtracted from its vertices, in double, so that float32 resolves them.
+        earth: Where on earth its coordinates are; None if unknown.
     """
 
     unit: str | None
     up: Vector | None
     origin: Vector
+    earth: Earth | None
 
     @classmethod
-    def of(cls, vertices: Float64[np.ndarray, "V 3"], unit: str | None, up: Vector | None) -> Placement:
+    def of(
+        cls,
+        vertices: Float64[np.ndarray, "V 3"],
+        unit: str | None,
+        up: Vector | None,
+        earth: Earth | None = None,
+    ) -> Placement:
         """Return the placement of vertices; their origin is `gsplat_edu.scene.frame.origin_of`."""
-        return cls(unit, up, as_origin("vertices", origin_of(vertices)))
+        return cls(unit, up, as_origin("vertices", origin_of(vertices)), earth)
 
     @property
     def metres(self) -> float:
@@ -246,6 +258,12 @@ class Placement:
         """Rotation and translation of the file's root, in its axes and its unit."""
         turn, shift = root_transform(self.up, self.origin)
         return turn, self.metres * shift
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What the file states as JSON about the coordinates that it has once a known unit is the metre."""
+        earth = None if self.earth is None else self.earth.after(np.diag([*3 * [1.0 / self.metres], 1.0]))
+        return extras(SceneFrame(self.up, self.unit and "m", earth=earth))
 
 
 def turned_positions(

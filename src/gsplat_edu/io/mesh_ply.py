@@ -2,7 +2,7 @@
 
 Coordinates are double because a mesh's are float64: what is written is read back to the bit, and a mesh far from its
 origin, in the coordinates of a survey, keeps its details. A face takes 13 bytes, a vertex 24, or 27 with colours.
-Coordinates are those of the scene: nothing is flipped. The unit is a comment, as in scene PLYs.
+Coordinates are those of the scene: nothing is flipped. Unit and place on earth are comments, as in scene PLYs.
 
 Files of any program are read: binary of either byte order or ASCII, any number types, further properties and elements.
 Faces with more than three corners are cut into triangles.
@@ -34,6 +34,7 @@ from gsplat_edu.io.mesh_parts import (
     triangles_in,
 )
 from gsplat_edu.io.ply_comments import OURS, read_comments
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.mesh import Mesh
 
 COORDINATES = ("x", "y", "z")
@@ -51,11 +52,12 @@ LARGEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
 """Value of white by number type. Other types hold no colours."""
 
 
-def write(path: Path, mesh: Mesh, unit: str | None) -> None:
+def write(path: Path, mesh: Mesh, unit: str | None, earth: Earth | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     fields = [(name, "<f8") for name in COORDINATES]
     header = ["ply", "format binary_little_endian 1.0", "comment made by gsplat-edu"]
     header += [f"comment {OURS} unit {unit}"] * (unit is not None)
+    header += [f"comment {OURS} earth {earth}"] * (earth is not None)
     header += [f"element vertex {len(mesh.vertices)}", *(f"property double {name}" for name in COORDINATES)]
     if mesh.colors is not None:
         fields += [(name, "u1") for name in CHANNELS[0]]
@@ -80,7 +82,7 @@ def read(path: Path) -> StoredMesh:
     data = read_bytes(path)
     file = BytesIO(data)
     header = read_elements(path, file)
-    unit = read_comments(path, header.comments)[1].unit
+    frame = read_comments(path, header.comments)[1]
     by_name = {element.name: element for element in header.elements}
     vertex, face = by_name.get("vertex"), by_name.get("face")
     if vertex is None or not set(COORDINATES) <= set(vertex.names):
@@ -104,7 +106,8 @@ def read(path: Path) -> StoredMesh:
     check_vertices(path, points, lambda row: f"vertex {row}")
     sizes, corners = tables["face"][lists[0][0]]
     triangles = triangles_in(path, points, Polygons(sizes, corners, lambda row: f"face {row}"))
-    return StoredMesh(Mesh(points, corners[triangles], _colors(path, vertex, tables["vertex"])), unit)
+    mesh = Mesh(points, corners[triangles], _colors(path, vertex, tables["vertex"]))
+    return StoredMesh(mesh, frame.unit, frame.earth)
 
 
 def _numbers(table: dict[str, Any], names: tuple[str, ...]) -> Float64[np.ndarray, "V C"]:

@@ -3,7 +3,8 @@
 The package's first file, a binary layer of USD (usd-core writes it), holds the mesh, and a texture lies beside it
 (`gsplat_edu.io.usd_package`). The layer's axes and unit are those of glTF (`gsplat_edu.io.mesh_glb`): y points up, and
 a known unit becomes the metre. Points are float32, which is all that a mesh of USD has; the transform of the root, in
-double, turns the scene's up direction to y and moves the mesh to its origin.
+double, turns the scene's up direction to y and moves the mesh to its origin. The layer's customLayerData says where on
+earth the mesh is, if that is known.
 
 Colours of vertices are linear in USD (displayColor), and left out beside a texture, as in glTF. A texture stays sRGB,
 as the diffuse colour of a UsdPreviewSurface. USD has no unlit material, so a viewer adds its own light to the photos'.
@@ -25,21 +26,21 @@ from gsplat_edu.io.mesh_glb import linear
 from gsplat_edu.io.mesh_image import encoded
 from gsplat_edu.io.mesh_parts import Placement, turned_positions, vertex_normals
 from gsplat_edu.io.usd_package import require_usd, write_package
-from gsplat_edu.scene.frame import Vector
+from gsplat_edu.io.usd_stage import MARK
 from gsplat_edu.scene.mesh import Mesh
 
 LAYER = "mesh.usdc"
 """Name of the layer in the package."""
 
 
-def write(path: Path, mesh: Mesh, unit: str | None, jpeg: int | None, up: Vector | None) -> None:
+def write(path: Path, mesh: Mesh, placement: Placement, jpeg: int | None) -> None:
     """Write a mesh; see `gsplat_edu.io.mesh_files.write_mesh`."""
     require_usd(".usdz")
     files, image = [], ""
     if mesh.texture is not None:
         image = "texture.png" if jpeg is None else "texture.jpg"
         files.append((image, encoded(mesh.texture.image, jpeg)))
-    files.insert(0, (LAYER, _layer(path, mesh, Placement.of(mesh.vertices, unit, up), image)))
+    files.insert(0, (LAYER, _layer(path, mesh, placement, image)))
     write_package(path, ((name, (data,)) for name, data in files), "write a .ply")
 
 
@@ -51,6 +52,8 @@ def _layer(path: Path, mesh: Mesh, placement: Placement, image: str) -> bytes:
     stage = Usd.Stage.CreateInMemory(LAYER)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    if "earth" in placement.stated:
+        stage.GetRootLayer().customLayerData = {MARK: {"earth": placement.stated["earth"]}}
     root = UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
     turn, shift = placement.root

@@ -12,7 +12,7 @@ EXAMPLE = "example: gsplat-edu info captures/plush"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    meant = "capture, run folder or scene file; without it, describe this computer and its GPUs"
+    meant = "capture, run folder, scene or mesh file; without it, describe this computer and its GPUs"
     parser.add_argument("path", type=Path, metavar="PATH", nargs="?", help=meant)
     add_poses(parser)
     add_trust(parser)

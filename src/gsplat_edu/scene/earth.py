@@ -3,7 +3,8 @@
     place = A (coordinates + origin) + b
 
 Earth-centred coordinates (EPSG:4978) are those of GPS: x towards 0 N 0 E, y towards 0 N 90 E, z towards the north pole.
-With a projected system, such as EPSG:32633, the places are easting, northing and height.
+With a projected system, such as EPSG:32633, the places are easting, northing and height. `converted` takes places from
+one system to another by PROJ (the package pyproj, which only projected systems need).
 
 Source: NIMA TR8350.2 for the ellipsoid; Bowring 1985 for latitude and height from earth-centred coordinates.
 """
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.text import install_command
 from gsplat_edu.base.validation import ArrayLike, float64_array
 from gsplat_edu.scene.frame import FARTHEST_ORIGIN
 
@@ -30,6 +32,9 @@ EARTH_CENTRED = "EPSG:4978"
 
 NEAR_SURFACE = 50_000.0
 """Positions this close to the ellipsoid, m, are taken to be earth-centred coordinates."""
+
+STEP = 10.0
+"""Metres over which the derivatives of a conversion between systems are taken."""
 
 CODE = re.compile(r"[A-Za-z]+:[0-9]+(\+[0-9]+)?")
 """A system by its authority and number, if need be with that of its heights."""
@@ -123,6 +128,45 @@ class Earth:
         rows = self.rows @ float64_array("inverse", inverse, (4, 4))
         return replace(self, matrix=tuple(rows.ravel().tolist()))
 
+    def on_globe(self, position: ArrayLike) -> Earth:
+        """Return the map to earth-centred coordinates that agrees with this one at a position, and in its derivatives.
+
+        A projected system follows the ellipsoid, which the map cannot: d metres away, it errs by d² / (2 SEMI_MAJOR) in
+        height, which is 8 cm at 1 km.
+
+        Args:
+            position: (3,) coordinates with the origin added.
+
+        Raises:
+            ArgumentError: as for `converted`.
+        """
+        if self.crs == EARTH_CENTRED:
+            return self
+        A, b = self.rows[:, :3], self.rows[:, 3]
+        place = A @ float64_array("position", position, (3,)) + b
+        around = STEP * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+        found = converted(place + around, self.crs, EARTH_CENTRED)
+        derivative = (found[1:4] - found[4:]).T / (2.0 * STEP)
+        return Earth.of(derivative @ A, found[0] + derivative @ (b - place))
+
+    def positions_of(self, places: ArrayLike, crs: str) -> Float64[np.ndarray, "n 3"]:
+        """Return the coordinates of places, with the origin added: the inverse of this map.
+
+        Args:
+            places: (n, 3), as for `converted`.
+            crs: The code of their system.
+
+        Raises:
+            ArgumentError: as for `converted`, or the map has no inverse.
+        """
+        A, b = self.rows[:, :3], self.rows[:, 3]
+        try:
+            back = np.linalg.inv(A)
+        except np.linalg.LinAlgError:
+            raise ArgumentError("matrix: is singular; give another place on earth") from None
+        found: Float64[np.ndarray, "n 3"] = (converted(places, crs, self.crs) - b) @ back.T
+        return found
+
     def place_of(self, position: ArrayLike) -> str:
         """Return in words where a position is.
 
@@ -133,7 +177,12 @@ class Earth:
         place = rows[:, :3] @ float64_array("position", position, (3,)) + rows[:, 3]
         if self.crs != EARTH_CENTRED:
             x, y, z = place.tolist()
-            return f"{x:.2f} east, {y:.2f} north, {z:.2f} up in {self.crs}"
+            said = f"{x:.2f} east, {y:.2f} north, {z:.2f} up in {self.crs}"
+            try:
+                latitude, longitude, _ = geodetic(converted(place[None], self.crs, EARTH_CENTRED)[0])
+            except ArgumentError:
+                return said
+            return f"{said}: {latitude:.6f}, {longitude:.6f} degrees"
         latitude, longitude, height = geodetic(place)
         return f"{latitude:.6f}, {longitude:.6f} degrees, {height:.1f} m above the ellipsoid (WGS 84)"
 
@@ -149,6 +198,45 @@ def code_of(described: str) -> str | None:
         return text
     found = LAST_CODE.search(text)
     return f"{found[1]}:{found[2]}" if found else None
+
+
+def converted(places: ArrayLike, source: str, target: str) -> Float64[np.ndarray, "n 3"]:
+    """Convert places from one system to another by PROJ.
+
+    Heights of a system without any are taken as heights above its ellipsoid.
+
+    Args:
+        places: (n, 3) in the order east, north, up; x, y, z of earth-centred systems.
+        source: The system's code.
+        target: The code of the other system.
+
+    Returns:
+        (n, 3) places in the other system; infinity or NaN for those outside of a system.
+
+    Raises:
+        ArgumentError: pyproj is not installed, does not know a system or a grid between the two, or all places are
+            outside.
+    """
+    try:
+        import pyproj
+    except ImportError:
+        raise ArgumentError(
+            f"{source}: needs pyproj, which is not installed: {install_command('scans')}"
+        ) from None
+    try:
+        first, second = (pyproj.CRS.from_user_input(code).to_3d() for code in (source, target))
+        transformer = pyproj.Transformer.from_crs(first, second, always_xy=True, allow_ballpark=False)
+        found = np.stack(transformer.transform(*np.asarray(places, dtype=np.float64).T), axis=1)
+    except pyproj.exceptions.CRSError:
+        raise ArgumentError(f"{source}: PROJ does not know it, or not {target}; give another code") from None
+    except pyproj.exceptions.ProjError:
+        found = np.full((1, 3), np.nan)
+    if not np.isfinite(found).all(axis=1).any():
+        raise ArgumentError(
+            f"{source}: PROJ cannot convert its places to {target}: they lie outside, or heights need a grid that is"
+            " not installed; give a system without heights"
+        )
+    return found
 
 
 def earth_centred(places: ArrayLike) -> Float64[np.ndarray, "n 3"]:

@@ -31,6 +31,8 @@ def routes() -> list[BaseRoute]:
         act("/api/captures/{name}/notes", "GET", _notes),
         act("/api/captures/{name}/region", "GET", _region),
         act("/api/captures/{name}/region", "POST", _change_region),
+        act("/api/captures/{name}/poses", "GET", _poses),
+        act("/api/captures/{name}/poses", "POST", _choose_poses),
         act("/api/captures/{name}/mask", "GET", _mask),
         act("/api/captures/{name}/mask", "POST", _draw),
     ]
@@ -80,6 +82,33 @@ def _change_region(studio: Studio, request: Request, body: Any) -> dict[str, Any
     except ArgumentError as error:
         raise RefusedError(str(error)) from None
     write_region(studio.library.entry("captures", request.path_params["name"]), region)
+    studio.stream.library_changed()
+    return {}
+
+
+def _poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    from gsplat_edu.data.chosen_poses import CHOSEN, chosen_poses, pose_choices
+    from gsplat_edu.data.colmap import find_model
+
+    entry = studio.library.entry("captures", request.path_params["name"])
+    files = [{"file": file, "program": program} for file, program in pose_choices(entry)]
+    has_choice = len(files) + (find_model(entry) is not None) > 1
+    try:
+        chosen = chosen_poses(entry)
+    except DatasetError as error:
+        raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
+    is_chosen = (entry / CHOSEN).is_file()
+    return {
+        "files": files if has_choice else [],
+        "chosen": chosen.relative_to(entry).as_posix() if is_chosen else None,
+    }
+
+
+def _choose_poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
+    from gsplat_edu.data.chosen_poses import choose_poses
+
+    entry = studio.library.entry("captures", request.path_params["name"])
+    choose_poses(entry, fields(body, file=str)["file"] or None)
     studio.stream.library_changed()
     return {}
 

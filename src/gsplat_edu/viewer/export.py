@@ -175,12 +175,21 @@ def write_refined(
     return scores
 
 
-def levels_line(path: Path) -> str:
-    """Describe the levels of a written lod-meta.json, or the tiles of a tileset.json, in one line."""
+def levels_line(path: Path, scene: Scene) -> str:
+    """Describe the levels of a written lod-meta.json, or the tiles of a tileset.json, in one line.
+
+    Args:
+        path: The file.
+        scene: What was written into it.
+    """
     if path.name.lower() == TILESET:
         count = len(list((path.parent / "tiles").glob("*.glb")))
         size = f"{formats.stored_bytes(path):,} bytes"
-        return f"{count} tiles, {size}; upright, but not placed on the globe: no capture stores where on Earth it is"
+        try:
+            middle = tiles.on_globe(scene).place_of(scene.origin)
+        except ArgumentError as error:
+            return f"{count} tiles, {size}; upright, but not placed on the globe: {error}"
+        return f"{count} tiles, {size}; on the globe, zero at {middle}"
     index = lod_codec.read_index(path)
     counts = ", ".join(f"{count:,}" for count in index.counts())
     errors = [max(region.errors[level] for region in index.regions) for level in range(index.levels)]

@@ -15,7 +15,7 @@ from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.formats import read_scene, stored_bytes, write_scene
 from gsplat_edu.io.lod import tiles
 from gsplat_edu.io.scene import Scene
-from gsplat_edu.scene.earth import Earth
+from gsplat_edu.scene.earth import Earth, earth_centred, local_axes
 from scene_files import random_scene
 
 LEAF = 200
@@ -194,3 +194,21 @@ def test_a_scene_whose_place_is_known_lies_there_and_reads_back(tmp_path):
     np.testing.assert_allclose(
         np.sort(found.gaussians.means.double().numpy() + found.origin, axis=0), means, atol=1e-3
     )
+
+
+def test_a_scene_in_the_coordinates_of_a_map_lies_on_the_globe(tmp_path):
+    """UTM's zone 33 has its middle at 15 degrees east; the scene's y is north there."""
+    earth = Earth.of(np.eye(3), (500_000.0, 0.0, 0.0), "EPSG:32633")
+    scene = replace(random_scene(30, 3), up=(0.0, 0.0, 1.0), unit="m", earth=earth)
+    write_scene(tmp_path / "tileset.json", scene)
+    root = np.array(json.loads((tmp_path / "tileset.json").read_text())["root"]["transform"]).reshape(4, 4).T
+    east, north, up = local_axes(0.0, 15.0)
+    expected = earth_centred([(0.0, 15.0, 0.0)])[0] + (east + 2.0 * north) / 0.9996 + 3.0 * up
+    np.testing.assert_allclose(
+        (root @ [1.0, 3.0, -2.0, 1.0])[:3], expected, atol=1e-5
+    )  # tiles: right, up, back
+    assert read_scene(tmp_path / "tileset.json").earth == earth
+    unknown = replace(scene, earth=Earth.of(np.eye(3), (0, 0, 0), "EPSG:999999"))
+    write_scene(tmp_path / "b" / "tileset.json", unknown)
+    upright = json.loads((tmp_path / "b" / "tileset.json").read_text())["root"]["transform"]
+    assert np.abs(np.array(upright)).max() <= 1.0

@@ -18,8 +18,8 @@ how Cesium knows splats. Accessors describe the unpacked values and have no buff
 Axes: SPZ and glTF right, up, back; tiles right, forward, up, because glTF's y becomes 3D Tiles' z. CesiumJS takes the
 coordinates of the SPZ as they are, and so do we. The draft of the extension would turn them by half a turn about y on
 unpacking; a program that does so shows the scene turned about the vertical. The root's transform turns the scene's up
-direction to +z and moves it to its origin, in double; if the scene's earth-centred coordinates are known, it takes the
-scene to its place on the globe instead.
+direction to +z and moves it to its origin, in double; if the scene's place on earth is known, it takes the scene to its
+place on the globe instead (`on_globe`).
 
 Source: OGC, "3D Tiles 1.1"; Khronos, KHR_gaussian_splatting_compression_spz_2 (draft); CesiumJS' loader, for the axes
 and the accessors.
@@ -48,7 +48,7 @@ from gsplat_edu.io.lod.meta import rounded
 from gsplat_edu.io.lod.tiles_reading import FROM_SCENE, FROM_Y_UP
 from gsplat_edu.io.scene import Scene, extras
 from gsplat_edu.io.spz import packed_version_2
-from gsplat_edu.scene.earth import EARTH_CENTRED
+from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.gaussians import Gaussians
 
 CONTENT_EXTENSION = "3DTILES_content_gltf"
@@ -94,6 +94,21 @@ def write(path: Path, scene: Scene, options: LodOptions | None = None) -> None:
 def read(path: Path) -> Scene:
     """Read the finest tiles of a tileset; see `gsplat_edu.io.lod.tiles_reading.read`."""
     return tiles_reading.read(path)
+
+
+def on_globe(scene: Scene) -> Earth:
+    """Return the map from a scene's coordinates to earth-centred ones, which is exact in the middle of its splats.
+
+    Args:
+        scene: The scene; at least one splat.
+
+    Raises:
+        ArgumentError: the scene does not say where on earth it is, or as for `gsplat_edu.scene.earth.converted`.
+    """
+    if scene.earth is None:
+        raise ArgumentError("the scene does not say where on earth it is")
+    middle = np.median(scene.gaussians.means.double().numpy(force=True), axis=0)
+    return scene.earth.on_globe(middle + scene.origin)
 
 
 def tile_options(smallest: int | None = None, leaf: int | None = None) -> LodOptions:
@@ -216,10 +231,10 @@ def _box(low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> list[
 def _root_matrix(scene: Scene) -> list[float]:
     """Return the transform to the globe, or else to z up and the origin: 4 x 4, column by column."""
     matrix = np.eye(4)
-    if scene.earth is not None and scene.earth.crs == EARTH_CENTRED:
-        A, b = scene.earth.rows[:, :3], scene.earth.rows[:, 3]
-        matrix[:3, :3], matrix[:3, 3] = A @ FROM_SCENE.T, A @ scene.origin + b
-    else:
+    try:
+        rows = on_globe(scene).rows
+        matrix[:3, :3], matrix[:3, 3] = rows[:, :3] @ FROM_SCENE.T, rows[:, :3] @ scene.origin + rows[:, 3]
+    except ArgumentError:
         turn, shift = root_transform(scene.up, scene.origin)
         matrix[:3, :3], matrix[:3, 3] = FROM_Y_UP @ turn @ FROM_Y_UP.T, FROM_Y_UP @ shift
     return [float(number) + 0.0 for number in matrix.T.reshape(-1)]

@@ -22,6 +22,7 @@ import { startJob } from "./jobs.js";
 import { addressOf, factsOf } from "./entries.js";
 import { entryHead, management, withEntry } from "./screen.js";
 import { places } from "./places.js";
+import { poses } from "./poses.js";
 
 const QUALITIES = [
   ["draft", "Draft", "a quick look"],
@@ -98,6 +99,10 @@ function training(store, stage, entry) {
     },
   );
   const start = startForm(store, entry, () => taken.draw());
+  const whose = poses(entry, () => {
+    taken.read();
+    store.refresh();
+  });
   const later = h("div", { class: "later", hidden: true }, management(store, entry));
   const missing = h("div", {});
   const said = h("ul", { class: "plain quiet", "aria-label": "what was read", hidden: true });
@@ -106,6 +111,7 @@ function training(store, stage, entry) {
   stage.append(
     head.element,
     said,
+    whose.element,
     missing,
     h("div", { class: "watch" }, taken.element, start.element),
     past,
@@ -132,6 +138,7 @@ function training(store, stage, entry) {
       head.update(now);
       patch(missing, unplaced(now, now.made_from));
       notes.read(now.modified);
+      whose.read(now);
       checked.update(now);
       start.update(now);
       if (now.modified !== version) taken.changed();

@@ -84,6 +84,8 @@ export function frame(title) {
       address = next;
       open();
     },
+    // Loads the page again, which has become another one.
+    again: open,
     close() {
       address = null;
       clearTimeout(timer);

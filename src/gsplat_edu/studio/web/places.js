@@ -52,6 +52,11 @@ export function places(entry, left, region) {
       if (known) known.left(photos);
       else for (const [photo, out] of photos) changes.set(photo, out);
     },
+    // Other poses were chosen: shows the page of these.
+    read() {
+      known = null;
+      scene.again();
+    },
     // The capture has changed: another tab may have saved or removed the box. A page that loads asks by itself.
     changed() {
       known?.region.load().catch((error) => known.region.say(error.message));

@@ -1,0 +1,44 @@
+// Whose poses a capture is read with, if its folder has those of several programs.
+
+import { at, get, post } from "./api.js";
+import { errorLine, h, patch, put, versioned, want } from "./dom.js";
+
+// chosen() is called after another file was chosen.
+export function poses(entry, chosen) {
+  const line = errorLine();
+  const select = h("select", { id: "poses", onchange: () => choose(select.value) });
+  const element = h(
+    "div",
+    { hidden: true },
+    h("label", { class: "row" }, "Cameras from ", select),
+    h("p", { class: "quiet" }, "Several programs left cameras here. A training uses those that you choose."),
+    line,
+  );
+
+  async function choose(file) {
+    select.disabled = true;
+    put(line, "");
+    try {
+      await post(at(entry.entry, "poses"), { file });
+      chosen();
+    } catch (error) {
+      put(line, error.message);
+    }
+    select.disabled = false;
+  }
+
+  const found = versioned(
+    line,
+    () => get(at(entry.entry, "poses")),
+    ({ files, chosen: file }) => {
+      element.hidden = !files.length;
+      const usual = want("option", { value: "" }, "the file that train reads by itself");
+      const options = files.map(({ file: value, program }) =>
+        want("option", { value }, value === program ? value : `${program}: ${value}`),
+      );
+      patch(select, [usual, ...options]);
+      select.value = file ?? "";
+    },
+  );
+  return { element, read: (now) => found.read(now.modified) };
+}
