@@ -19,7 +19,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCUMENT = ROOT / "docs" / "LICENCES.md"
-EXTRAS = ("sfm", "course", "heic", "cluster", "gpu", "mesh", "depth", "usd")
+EXTRAS = ("sfm", "course", "heic", "cluster", "gpu", "mesh", "depth", "usd", "scans")
 """Extras that users install. Those of developers are tools, which nothing that we give away contains."""
 
 COMPATIBLE = {

@@ -161,11 +161,17 @@ def test_views_are_scored_over_the_background_in_their_order():
         View(camera, black, mask=none, name="nothing counts"),
         View(camera, np.full((4, 5, 3), 0.5), name="grey"),
     ]
-    seen = []
+    seen, told = [], []
     scores = score_views(
-        no_gaussians(), views, grey_renderer, (1.0, 0.5, 0.5), lambda *scored: seen.append(scored[0].name)
+        no_gaussians(),
+        views,
+        grey_renderer,
+        (1.0, 0.5, 0.5),
+        lambda *scored: seen.append(scored[0].name),
+        lambda view, score: told.append((view.name, score)),
     )
     assert [score.name for score in scores] == seen == ["black", "clear", "grey"]
+    assert told == list(zip(seen, scores, strict=True))
     assert scores[0].psnr == pytest.approx(10 * math.log10(4), abs=1e-9)
     # An opaque grey render is off by one half over black and over white, whatever the background.
     assert scores[1].psnr == pytest.approx(10 * math.log10(4), abs=1e-9)
@@ -173,6 +179,19 @@ def test_views_are_scored_over_the_background_in_their_order():
     means = summarize(scores)
     assert means["num_images"] == 3
     assert means["psnr"] == pytest.approx(sum(s.psnr for s in scores) / 3, abs=1e-12)
+
+
+def test_who_is_told_a_score_can_end_the_scoring():
+    views, told = [View(Camera(np.eye(3), (0, 0, 0), 10, 10, 2, 2, 4, 5), np.zeros((4, 5, 3)))] * 4, []
+
+    def stop(view, score):
+        told.append(score)
+        if len(told) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        score_views(no_gaussians(), views, grey_renderer, (0.0, 0.0, 0.0), on_score=stop)
+    assert len(told) == 2
 
 
 def test_no_images_means_no_averages():

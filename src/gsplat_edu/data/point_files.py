@@ -95,9 +95,7 @@ def _las_system(path: Path) -> str | None:
     with _library("laspy", path).open(path) as file:
         try:
             system = file.header.parse_crs()
-        except (
-            Exception
-        ):  # pyproj is not installed, or does not understand the file's text: many errors of two packages
+        except Exception:  # without pyproj, or of a text that it does not know: many errors of two packages
             return None
     if system is None:
         return None

@@ -22,7 +22,9 @@ Chapter: 14_photos_to_scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -99,6 +101,9 @@ BLURRED_FROM = 0.25
 
 OnImage = Callable[[View, ImageScore, UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W 3"]], None]
 """Called after each scored view with the view, its score, the render and the photo, both rounded to bytes."""
+
+OnScore = Callable[[View, ImageScore], None]
+"""Called after each scored view with the view and its score."""
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -368,31 +373,44 @@ def score_views(
     render: Renderer,
     background: ArrayLike,
     on_image: OnImage | None = None,
+    on_score: OnScore | None = None,
 ) -> list[ImageScore]:
-    """Render views and compare them with their photos.
+    """Render views and compare them with their photos; the next one is rendered meanwhile.
 
     Args:
         gaussians: N Gaussians.
         views: Cameras and photos. Views whose mask excludes all pixels are skipped.
         render: Renders Gaussians from a camera, over `background`.
         background: (3,) colour behind the renders; photos with alpha are scored as `score_photo` says.
-        on_image: Called after each scored view.
+        on_image: Called after each scored view, in their order.
+        on_score: The same, without pictures.
 
     Returns:
         The scores, in the order of the views.
     """
-    scores = []
-    for view in views:
-        photo: Photo = view.read()
-        if photo.mask is not None and not photo.mask.any():
-            continue
-        with torch.no_grad():
-            output = render(gaussians, view.camera)
-        image, truth = output.image, photo.over(background)
-        score = score_photo(view.name, photo, output, background)
-        scores.append(score)
+    scores = list[ImageScore]()
+
+    def told(view: View, photo: Photo, output: RenderOutput, scored: Future[ImageScore]) -> None:
+        scores.append(scored.result())
+        if on_score is not None:
+            on_score(view, scores[-1])
         if on_image is not None:
-            on_image(view, score, to_bytes(image), to_bytes(truth))
+            on_image(view, scores[-1], to_bytes(output.image), to_bytes(photo.over(background)))
+
+    with ThreadPoolExecutor(max_workers=1) as worker:
+        waiting = None
+        for view in views:
+            photo: Photo = view.read()
+            if photo.mask is not None and not photo.mask.any():
+                continue
+            with torch.no_grad():
+                output = render(gaussians, view.camera)
+            scored = worker.submit(score_photo, view.name, photo, output, background)
+            if waiting is not None:
+                told(*waiting)
+            waiting = view, photo, output, scored
+        if waiting is not None:
+            told(*waiting)
     return scores
 
 
@@ -436,9 +454,10 @@ def _as_array(image: ArrayLike) -> np.ndarray:
 
 def _gradient_energy(image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2"]:
     """Return the mean squared horizontal and vertical differences at half size, over the squared mean brightness."""
-    grey = image.mean(axis=2)
-    H, W = (side // 2 for side in grey.shape)
-    small = grey[: 2 * H, : 2 * W].reshape(H, 2, W, 2).mean(axis=(1, 3))
+    H, W = (2 * (side // 2) for side in image.shape[:2])
+    grey = (image[:H, :W, 0] + image[:H, :W, 1] + image[:H, :W, 2]) / 3.0
+    rows = grey[::2] + grey[1::2]
+    small = (rows[:, ::2] + rows[:, 1::2]) / 4.0
     energy = np.array([np.square(np.diff(small, axis=axis)).mean() for axis in (1, 0)])
     return np.asarray(energy / max(float(small.mean()), 1e-3) ** 2)
 
@@ -467,11 +486,21 @@ class _Pair:
             if not self.counts.any():
                 raise ArgumentError("mask: no pixel counts; leave the image out")
 
+    @cached_property
+    def difference(self) -> Float64[np.ndarray, "H W 3"]:
+        """The render less the photo."""
+        return self.render - self.photo
+
     def psnr(self) -> float:
-        return self._decibels(self.render)
+        return _decibels(self._mean(np.square(self.difference)))
 
     def psnr_8bit(self) -> float:
-        return self._decibels(to_bytes(self.render) / 255.0)
+        error = 255.0 * self.render
+        error += 0.5
+        np.floor(error, out=error)
+        error /= 255.0
+        error -= self.photo
+        return _decibels(self._mean(np.square(error, out=error)))
 
     def ssim(self) -> float:
         planes = (self.render, self.photo)
@@ -506,11 +535,12 @@ class _Pair:
         return float(np.log(render / photo).max())
 
     def l1(self) -> float:
-        return self._mean(np.abs(self.render - self.photo))
+        return self._mean(np.abs(self.difference))
 
     def _mean(self, errors: Float64[np.ndarray, "H W 3"]) -> float:
         return float((errors if self.counts is None else errors[self.counts]).mean())
 
-    def _decibels(self, render: Float64[np.ndarray, "H W 3"]) -> float:
-        error = self._mean(np.square(render - self.photo))
-        return float(-10.0 * np.log10(max(error, MSE_FLOOR)))
+
+def _decibels(error: float) -> float:
+    """Return the PSNR of a mean squared error."""
+    return float(-10.0 * np.log10(max(error, MSE_FLOOR)))

@@ -111,12 +111,12 @@ def evaluate_run(
     test_views, train_views = ((), ()) if judged.skipped else (judged.test, judged.train)
     gallery = _Gallery(into, test_views, progress)
 
-    def tell(view: View, score: ImageScore, image: Image, truth: Image) -> None:
+    def tell(view: View, score: ImageScore) -> None:
         if progress is not None:
             progress("train", score)
 
     test = score_views(gaussians, test_views, render, judged.background, gallery.add)
-    train = score_views(gaussians, train_views, render, judged.background, tell)
+    train = score_views(gaussians, train_views, render, judged.background, on_score=tell)
     metrics = {**earlier, **_scores(judged, test, train), "num_gaussians": len(gaussians)}
     metrics |= scored(config) | dict(facts or {})
     title, notes = f"{folder.path.resolve().name}: 3D Gaussian Splatting", [*map(str, judged.notes)]

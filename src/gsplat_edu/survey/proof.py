@@ -205,43 +205,46 @@ def _matched(photos: Sequence[Frame], pairs: Sequence[tuple[int, int]]) -> list[
 
 def _errors(photos: Sequence[Frame], pairs: Sequence[_Pair]) -> list[Float64[np.ndarray, "..."]]:
     """Return the error of each match of each pair, px of the photos as their lenses give them."""
-    found = []
+    far, rays, centres, focal = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[float]()
     for pair in pairs:
         one, other = photos[pair.one], photos[pair.other]
         turn = other.R @ one.R.T
         a, b = pair.rays_of((one.lens, other.lens))
-        there = _to_arcs(a @ turn.T, b, other.R @ (one.eye - other.eye))
-        back = _to_arcs(b @ turn, a, one.R @ (other.eye - one.eye))
-        angles = np.where(np.isfinite(there + back), there + back, np.pi) / 2.0
-        found.append(angles * (max(one.lens.fx, one.lens.fy) + max(other.lens.fx, other.lens.fy)) / 2.0)
-    return found
+        far += [a @ turn.T, b @ turn]
+        rays += [b, a]
+        centres += [other.R @ (one.eye - other.eye), one.R @ (other.eye - one.eye)]
+        focal.append((max(one.lens.fx, one.lens.fy) + max(other.lens.fx, other.lens.fy)) / 2.0)
+    counts = [len(part) for part in rays]
+    angles = _to_arcs(np.concatenate(far), np.concatenate(rays), np.repeat(np.stack(centres), counts, axis=0))
+    parts = np.split(angles, np.cumsum(counts)[:-1])
+    both = [there + back for there, back in zip(parts[::2], parts[1::2], strict=True)]
+    return [px * np.where(np.isfinite(sums), sums, np.pi) / 2.0 for sums, px in zip(both, focal, strict=True)]
 
 
 def _to_arcs(
-    far: Float64[np.ndarray, "m 3"], rays: Float64[np.ndarray, "m 3"], centre: Float64[np.ndarray, "3"]
+    far: Float64[np.ndarray, "m 3"], rays: Float64[np.ndarray, "m 3"], centres: Float64[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, " m"]:
     """Return the angle between rays and arcs from `far` to the other camera's centre, radians.
 
     Args:
         far: Directions of the other rays' points at infinity, in this camera's axes.
         rays: This camera's rays.
-        centre: (3,) the other camera's centre, in this camera's axes; any length.
+        centres: (m, 3) the other camera's centre, in this camera's axes; any length.
     """
     ends: Float64[np.ndarray, " m"] = np.minimum(_angles(far, rays), np.pi)
-    length = float(np.linalg.norm(centre))
-    if length < 1e-12:
-        return ends
-    e = centre / length
-    ends = np.minimum(ends, _angles(np.broadcast_to(e, rays.shape), rays))
+    lengths = np.linalg.norm(centres, axis=1, keepdims=True)
+    apart = lengths[:, 0] >= 1e-12
+    e = centres / np.maximum(lengths, 1e-12)
+    ends = np.where(apart, np.minimum(ends, _angles(e, rays)), ends)
     normals = np.cross(far, e)
     sizes = np.linalg.norm(normals, axis=1)
     normals = normals / np.maximum(sizes, 1e-12)[:, None]
     height = np.sum(normals * rays, axis=1)
     feet = rays - height[:, None] * normals
     between = (np.sum(np.cross(far, feet) * normals, axis=1) >= 0) & (
-        np.sum(np.cross(feet, e[None]) * normals, axis=1) >= 0
+        np.sum(np.cross(feet, e) * normals, axis=1) >= 0
     )
-    inside = between & (sizes > 1e-9)
+    inside = between & apart & (sizes > 1e-9)
     return np.asarray(np.where(inside, np.arcsin(np.clip(np.abs(height), 0.0, 1.0)), ends))
 
 

@@ -236,7 +236,8 @@ def _residual(
     error = smoothed_difference(image.clamp(0.0, 1.0).float().numpy(force=True), pixels, photo.mask)
     known = np.isfinite(error)
     planes = np.stack([np.nan_to_num(error), known.astype(np.float32)], axis=-1)
-    (sums,) = torch.autograd.grad(output.features, probe, torch.from_numpy(planes).to(probe))
+    # As a sum: given the planes as the gradient, torch would import sympy first, which takes seconds.
+    (sums,) = torch.autograd.grad((output.features * torch.from_numpy(planes).to(probe)).sum(), probe)
     found = sums.float().numpy(force=True)
     shown = np.flatnonzero(found[:, 1] > LEAST_WEIGHT)
     return error, shown, found[shown, 0] / found[shown, 1]
