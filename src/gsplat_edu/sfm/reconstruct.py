@@ -388,7 +388,13 @@ class _Run:
 
     def _match(self) -> dict[str, Any]:
         count, kind = len(self.photos), self.options.matcher
-        candidates = Candidates(self.photos, self.folder / "database.db", self.video, self.unit)
+        candidates = Candidates(
+            self.photos,
+            self.folder / "database.db",
+            self.video,
+            self.unit,
+            partial(self._progress, "comparing photos"),
+        )
         if kind == "auto":
             kind = candidates.automatic()
         chosen = candidates.of(kind)
@@ -400,8 +406,8 @@ class _Run:
         verified = self._match_pairs(chosen)
         part = self._connected(verified)
         if len(part) < count and self.options.matcher == "auto" and kind != "exhaustive":
-            # Neighbours in the sequence and similar photos did not connect all photos: try more pairs.
-            chosen |= candidates.farther(kind)
+            # Neighbours in the sequence and similar photos did not connect all photos: try more pairs of the others.
+            chosen |= candidates.farther(kind, part)
             verified = self._match_pairs(chosen)
             part = self._connected(verified)
         if not verified:
