@@ -20,8 +20,9 @@ FEW = 30
 """Up to this number of photos every pair is matched: 435 pairs, which took 40 to 100 s of processor time."""
 
 EXHAUSTIVE = 150
-"""Up to this number of photos, those that chosen pairs do not connect are matched with all others. Up to this number of
-faces of panoramas, every pair is matched: 11,175 pairs, ten minutes on two cores."""
+"""Up to this number of photos, those that chosen pairs do not connect, or that get no pose from likely pairs, are
+matched with all others. Up to this number of faces of panoramas, every pair is matched: 11,175 pairs, ten minutes on
+two cores."""
 
 COMPARED = 400
 """Largest number of photos of which all pairs are compared by their largest features: 79,800 pairs, a minute."""
@@ -99,11 +100,11 @@ class Candidates:
         return f"each photo is matched with those that follow it or look alike{nearby}"
 
     def farther(self, kind: str, part: Collection[int]) -> set[pairs.Pair]:
-        """Return more pairs, for photos that the automatic matcher `kind` did not connect.
+        """Return more pairs, for photos that the automatic matcher `kind` did not connect, or that got no pose.
 
         Args:
             kind: The matcher.
-            part: The photos that it connected; no more pairs among these are returned.
+            part: The other photos; no more pairs among these are returned.
         """
         inside = set(part)
         wider = self.of("exhaustive") if len(self.photos) <= EXHAUSTIVE else self.of(kind, 3)

@@ -217,7 +217,8 @@ class _Run:
         Returns:
             The number of connected photos.
         """
-        options, connected = self.options, matches["connected"]
+        options = self.options
+        connected: int = matches["connected"]
         wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
         if self.given is not None:
             wanted["poses"] = self.given.digest()
