@@ -15,10 +15,11 @@ from gsplat_edu.data.colmap import read_cameras
 from gsplat_edu.data.dataset import DataSettings, load_dataset
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.sfm.colmap import call
-from gsplat_edu.sfm.mapping import attempts
+from gsplat_edu.sfm.mapping import attempts, map_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.result import publish, published
 from gsplat_edu.sfm.source import needs_poses
+from gsplat_edu.sfm.stages import Stages
 from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import LIMIT, TURNED, cameras_of, check
 
@@ -223,6 +224,65 @@ def test_matches_of_an_earlier_matcher_are_removed(copied, monkeypatch):
         reconstruct(replace(copied, matcher="sequential"), progress=_stop_at_mapping)
     assert count("two_view_geometries") == count("matches") == 2
     assert count("descriptors") == features
+
+
+@pytest.mark.parametrize("first", ["leaves one out", "fails"])
+def test_photos_that_likely_pairs_do_not_place_are_matched_with_all_others(likely, monkeypatch, first):
+    map_once = prepared(likely, monkeypatch, {(0, 5), *itertools.combinations(range(1, 14), 2)}, first)
+    said = []
+    reconstruct(likely, said.append)
+    assert map_once.calls == 2 and len(cameras_of(likely.out)) == 14
+    with closing(sqlite3.connect(likely.out / "sfm" / "database.db")) as reader:
+        assert reader.execute("SELECT COUNT(*) FROM matches").fetchone()[0] == 91
+    count = 1 if first == "leaves one out" else 14
+    assert any(f"{count} photo" in line and "matching more of their pairs" in line for line in said)
+    assert [line.split(":")[0] for line in said if line.endswith(" s)")][-3:] == [
+        "more matches",
+        "mapping again",
+        "capture",
+    ]
+    if first == "leaves one out":
+        said.clear()
+        reconstruct(likely, said.append)
+        assert map_once.calls == 2, "a finished run is not mapped again"
+
+
+@pytest.mark.parametrize("first", ["leaves one out", "fails"])
+def test_photos_without_further_matches_are_not_mapped_again(likely, monkeypatch, first):
+    map_once = prepared(likely, monkeypatch, set(itertools.combinations(range(14), 2)), first)
+    if first == "fails":
+        with pytest.raises(DatasetError, match="not enough"):
+            reconstruct(likely)
+    else:
+        reconstruct(likely)
+        assert len(cameras_of(likely.out)) == 13
+    assert map_once.calls == 1
+
+
+@pytest.fixture
+def likely(copied, monkeypatch):
+    """A copy of the finished capture, whose photos are to be matched anew in likely pairs."""
+    monkeypatch.setattr("gsplat_edu.sfm.candidates.FEW", 13)
+    Stages(copied.out / "sfm" / "stages.json", print).forget("matches")
+    return copied
+
+
+def prepared(options, monkeypatch, pairs, first):
+    """Choose the likely pairs, and how the first mapping ends; the function that replaces it counts its calls."""
+    monkeypatch.setattr("gsplat_edu.sfm.likely.likely_pairs", lambda *choice: pairs)
+
+    def mapped(*arguments):
+        mapped.calls += 1
+        if mapped.calls == 1 and first == "fails":
+            raise DatasetError("not enough")
+        model = map_photos(*arguments)
+        if mapped.calls == 1:
+            model["names"] = sorted(model["names"])[1:]
+        return model
+
+    mapped.calls = 0
+    monkeypatch.setattr("gsplat_edu.sfm.reconstruct.map_photos", mapped)
+    return mapped
 
 
 def _stop_at_mapping(stage, count, total):

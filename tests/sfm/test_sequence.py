@@ -1,15 +1,13 @@
 """Photos taken in sequence are recognised, photos in other orders are not."""
 
-import sqlite3
-from contextlib import closing
-
 import numpy as np
 import pytest
 
-from gsplat_edu.sfm.candidates import EXHAUSTIVE, SEQUENCE, Candidates
+from gsplat_edu.sfm.candidates import COMPARED, EXHAUSTIVE, FEW, SEQUENCE, Candidates
 from gsplat_edu.sfm.pairs import all_pairs
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.sequence import CHANCE, FIRST, by_chance, find_sequence, natural_order, successors_alike
+from sfm.databases import random_descriptors, write_features
 
 
 def described(turns):
@@ -128,16 +126,13 @@ def lap_of(tmp_path):
 
     def make(turns, places=None, **changes):
         rng = np.random.default_rng(6)
-        world = rng.integers(0, 256, (400, 128)).astype(np.uint8)
-        where = rng.uniform(0.0, 2.0 * np.pi, len(world))
-        path = tmp_path / "database.db"
-        with closing(sqlite3.connect(path)) as writer, writer:
-            writer.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
-            writer.execute("CREATE TABLE descriptors (image_id INTEGER, data BLOB)")
-            for i, turn in enumerate(turns):
-                seen = np.abs(np.angle(np.exp(1j * (where - turn)))) < 0.4
-                writer.execute("INSERT INTO images VALUES (?, ?)", (i, f"{i:06}.jpg"))
-                writer.execute("INSERT INTO descriptors VALUES (?, ?)", (i, world[seen].tobytes()))
+        world = random_descriptors(rng, 400)
+        where, scales = rng.uniform(0.0, 2.0 * np.pi, len(world)), rng.uniform(1.0, 9.0, len(world))
+        path, photos = tmp_path / f"{len(turns)}.db", {}
+        for i, turn in enumerate(turns):
+            seen = np.abs(np.angle(np.exp(1j * (where - turn)))) < 0.4
+            photos[f"{i:06}.jpg"] = world[seen], scales[seen]
+        write_features(path, photos)
         files = sorted(names(len(turns)))
         photos = [
             PhotoFacts(name, f"{i:06}.jpg", 8, 8, place=None if places is None else places[i])
@@ -162,22 +157,40 @@ def test_photos_in_sequence_get_the_pairs_of_a_video_and_closed_loops(lap_of):
     first, last = order[0], order[89]
     assert (min(first, last), max(first, last)) in chosen, "the loop is closed"
     assert len(chosen) < len(all_pairs(90)) / 2
-    assert found.farther("sequence") == all_pairs(90), "all pairs are tried where photos do not connect"
+    unconnected = {5, 70}
+    more = {(a, b) for a, b in all_pairs(90) if {a, b} & unconnected}
+    assert found.farther("sequence", set(range(90)) - unconnected) == more, (
+        "photos that do not connect are matched with all others"
+    )
     assert str(found.sequence).startswith("the photos were taken in sequence: sorted by name, 8")
 
 
-def test_shuffled_photos_keep_all_pairs(lap_of):
-    shuffled = np.random.default_rng(7).permutation(laps(90, 1))
-    assert lap_of(shuffled).automatic() == "exhaustive"
+def test_shuffled_photos_are_matched_with_those_that_share_large_features(lap_of):
+    turns = np.random.default_rng(7).permutation(laps(90, 1))
+    told = []
+    found = lap_of(turns, progress=lambda *step: told.append(step))
+    assert found.automatic() == "likely"
+    chosen, order = found.of("likely"), np.argsort(turns).tolist()
+    assert {(min(p), max(p)) for p in zip(order, order[1:] + order[:1], strict=True)} <= chosen
+    apart = [abs(np.angle(np.exp(1j * (turns[i] - turns[j])))) for i, j in chosen]
+    assert max(apart) < 0.8, "photos that show nothing in common are not matched"
+    assert len(chosen) < len(all_pairs(90)) / 3 and chosen < found.of("likely", 3)
+    assert told[-1] == (len(all_pairs(90)), len(all_pairs(90)))
 
 
 def test_few_photos_keep_all_pairs(lap_of):
-    few = lap_of(turns_by_name(SEQUENCE - 1, 1))
-    assert few.automatic() == "exhaustive" and few.of("exhaustive") == all_pairs(SEQUENCE - 1)
+    few = lap_of(turns_by_name(FEW, 1))
+    assert few.automatic() == "exhaustive" and few.of("exhaustive") == all_pairs(FEW)
+    shuffled = np.random.default_rng(7).permutation(laps(FEW + 1, 1))
+    assert lap_of(shuffled).automatic() == "likely"
 
 
-def test_many_photos_without_an_order_are_paired_with_nearby_photos(lap_of):
-    count = EXHAUSTIVE + 1
+def test_faces_of_panoramas_keep_all_pairs(lap_of):
+    assert lap_of(turns_by_name(FEW + 6, 1), unit=6).automatic() == "exhaustive"
+
+
+def test_very_many_photos_without_an_order_are_paired_with_nearby_photos(lap_of):
+    count = COMPARED + 1
     places = [(47.0 + 0.001 * i, 8.0, 0.0) for i in range(count)]
     found = lap_of(np.random.default_rng(8).permutation(laps(count, 1)), places)
     assert found.automatic() == "nearest"
@@ -186,10 +199,19 @@ def test_many_photos_without_an_order_are_paired_with_nearby_photos(lap_of):
     )
 
 
+def test_photos_of_a_large_set_that_do_not_connect_get_more_partners(lap_of):
+    count = EXHAUSTIVE + 1
+    found = lap_of(np.random.default_rng(8).permutation(laps(count, 1)))
+    assert found.automatic() == "likely"
+    more = found.farther("likely", range(1, count))
+    assert more == {pair for pair in found.of("likely", 3) if 0 in pair} and more
+
+
 def test_the_reason_for_fewer_pairs_is_reported(lap_of):
     in_order = lap_of(turns_by_name(90, 1))
     assert in_order.reason("sequence").startswith("the photos were taken in sequence: sorted by name")
     assert in_order.reason("exhaustive") == ""
+    assert in_order.reason("likely").startswith("each photo is matched with those that share most")
     assert in_order.reason("nearest") == "each photo is matched with those that follow it or look alike"
 
 

@@ -15,7 +15,8 @@ GOOD = {
     "photos": {"summary": "", "names": ["a.jpg", "b/c.jpg"]},
     "features": {"summary": "", "few": ["a.jpg"]},
     "more features": {"summary": ""},
-    "matches": {"summary": "", "connected": 3},
+    "matches": {"summary": "", "connected": 3, "matched": 2, "kind": "likely"},
+    "more matches": {"summary": "", "connected": 3, "matched": 2},
     "mapping": {"summary": "", "folder": "models/1/0", "names": ["a"], "doubtful": [], "unclear": []},
 }
 
@@ -49,6 +50,8 @@ def test_facts_of_a_completed_stage_are_read(tmp_path, name):
         ("features", {"few": 3}),
         ("matches", {"connected": "3"}),
         ("matches", {"connected": True}),
+        ("matches", {"matched": -1}),
+        ("more matches", {"matched": "3"}),
     ],
 )
 def test_facts_that_lead_elsewhere_or_have_another_type_are_refused(tmp_path, name, change):

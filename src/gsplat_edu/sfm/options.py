@@ -74,7 +74,8 @@ class SfmOptions:
         frames: Most frames to take from a video.
         matcher: "exhaustive": all pairs. "sequential": each photo with the following ones. "nearest": these, similar
             photos, and photos taken nearby. "auto": for photos in sequence, from 60 on, the pairs of a video; otherwise
-            exhaustive up to 150 photos, else nearest; nearest for videos.
+            exhaustive up to 59 photos, up to 400 the pairs that share large features, else nearest; nearest for videos;
+            for panoramas exhaustive up to 150 faces.
         mapper: "incremental", "global", or "auto": incremental, then global if its result is insufficient.
         camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or SIMPLE_RADIAL_FISHEYE for fisheyes, or
             a model with more parameters if the photos support it. A fisheye's field of view may follow, as in

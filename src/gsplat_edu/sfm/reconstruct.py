@@ -195,11 +195,7 @@ class _Run:
         self._find_features(database)
         forget = partial(forget_matches, database[0])
         facts = self._stage("matches", {"matcher": options.matcher}, self._match, [], forget)
-        wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
-        if self.given is not None:
-            wanted["poses"] = self.given.digest()
-        connected = facts["connected"]
-        self.model = self._stage("mapping", wanted, lambda: self._map(connected), [self.folder / "models"])
+        connected = self._find_poses(facts)
         if line := moving_line(self.model.get("moving", 1.0)):
             self._say(line)
         if not all((options.out / part).is_dir() for part in ("images", "sparse/0")):
@@ -211,6 +207,43 @@ class _Run:
             said = f"only {count} of {total} {self._kind} have a pose; {self._diagnosis(connected)}"
             raise DatasetError(f"{options.out}: {said}; the incomplete capture is kept")
         return options.out
+
+    def _find_poses(self, matches: Mapping[str, Any]) -> int:
+        """Map the photos. If only likely pairs were matched, match more of photos left out, and map again.
+
+        Args:
+            matches: The facts of the stage "matches".
+
+        Returns:
+            The number of connected photos.
+        """
+        options = self.options
+        connected: int = matches["connected"]
+        wanted = {"mapper": options.mapper, "camera_model": options.camera_model, "method": MAPPING}
+        if self.given is not None:
+            wanted["poses"] = self.given.digest()
+
+        def mapped(stage: str) -> dict[str, Any]:
+            return self._stage(stage, wanted, lambda: self._map(connected), [self.folder / "models"])
+
+        failure: DatasetError | None = None
+        try:
+            self.model = mapped("mapping")
+        except DatasetError as error:
+            if matches.get("kind") != "likely":
+                raise
+            self.model, failure = {"names": []}, error
+        names = set(self.model["names"])
+        posed = [i for i, photo in enumerate(self.photos) if photo.copy in names]
+        if matches.get("kind") != "likely" or len(posed) == len(self.photos):
+            return connected
+        more = self._stage("more matches", {}, lambda: self._match_more(posed, matches["matched"]), [])
+        connected = more["connected"]
+        if more["matched"] > matches["matched"]:
+            self.model = mapped("mapping again")
+        elif failure is not None:
+            raise failure
+        return connected
 
     def _diagnosis(self, connected: int) -> str:
         copies = [self.folder / "photos" / photo.copy for photo in self.photos]
@@ -387,8 +420,7 @@ class _Run:
         return {"summary": f"{sum(found.values()):,} in {total - len(names)} photos", "few": few}
 
     def _match(self) -> dict[str, Any]:
-        count, kind = len(self.photos), self.options.matcher
-        candidates = Candidates(self.photos, self.folder / "database.db", self.video, self.unit)
+        count, kind, candidates = len(self.photos), self.options.matcher, self._candidates()
         if kind == "auto":
             kind = candidates.automatic()
         chosen = candidates.of(kind)
@@ -400,8 +432,8 @@ class _Run:
         verified = self._match_pairs(chosen)
         part = self._connected(verified)
         if len(part) < count and self.options.matcher == "auto" and kind != "exhaustive":
-            # Neighbours in the sequence and similar photos did not connect all photos: try more pairs.
-            chosen |= candidates.farther(kind)
+            # Neighbours in the sequence and similar photos did not connect all photos: try more pairs of the others.
+            chosen |= candidates.farther(kind, part)
             verified = self._match_pairs(chosen)
             part = self._connected(verified)
         if not verified:
@@ -409,7 +441,25 @@ class _Run:
         summary = f"{len(verified):,} of {len(chosen):,} pairs match"
         if len(part) < count:
             summary += f"; {len(part) // self.unit} of {count // self.unit} {self._kind} are connected"
-        return {"summary": summary, "connected": len(part)}
+        return {"summary": summary, "connected": len(part), "kind": kind, "matched": len(verified)}
+
+    def _match_more(self, posed: Sequence[int], before: int) -> dict[str, Any]:
+        """Match more pairs of the photos without a pose, after likely pairs.
+
+        Args:
+            posed: The other photos.
+            before: Number of pairs that match so far.
+        """
+        left = len(self.photos) - len(posed)
+        self._say(f"{left} photo{'s have' if left > 1 else ' has'} no pose: matching more of their pairs")
+        candidates = self._candidates()
+        verified = self._match_pairs(candidates.of("likely") | candidates.farther("likely", posed))
+        summary = f"{len(verified) - before:,} more pairs match"
+        return {"summary": summary, "connected": len(self._connected(verified)), "matched": len(verified)}
+
+    def _candidates(self) -> Candidates:
+        compared = partial(self._progress, "comparing photos")
+        return Candidates(self.photos, self.folder / "database.db", self.video, self.unit, compared)
 
     @property
     def _kind(self) -> str:

@@ -18,6 +18,7 @@ Model = Annotated[str, Meta(pattern=r"^models/\d{1,4}/\d{1,4}\Z(?#the folder of 
 FileName = Annotated[
     str, Meta(pattern=r"^(?!\.)[^/\\\x00\ud800-\udc7f\udd00-\udfff]{1,255}\Z(?#a file name)")
 ]
+Count = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 
 
 class Facts(Record, frozen=True, forbid_unknown_fields=False):
@@ -45,7 +46,9 @@ class _Features(Facts, frozen=True):
 
 
 class _Matches(Facts, frozen=True):
-    connected: Annotated[int, Meta(ge=0, le=2**31 - 1)]
+    connected: Count
+    matched: Count = 0
+    kind: Text = ""
 
 
 class _Mapping(Facts, frozen=True):
@@ -64,6 +67,8 @@ FACTS: Mapping[str, type[Facts]] = {
     "more features": Facts,
     "matches": _Matches,
     "mapping": _Mapping,
+    "more matches": _Matches,
+    "mapping again": _Mapping,
     "capture": Facts,
 }
 

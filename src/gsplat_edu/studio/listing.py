@@ -107,7 +107,7 @@ def _search_facts(file: Path, modified: int, size: int) -> dict[str, Any] | None
         stages = parse_json(read_text(file))["stages"]
         error = float(stages["capture"]["facts"]["error"])
         names = sorted(map(str, stages["photos"]["facts"]["names"]))
-        posed = len(stages["mapping"]["facts"]["names"])
+        posed = len(stages["mapping again" if "mapping again" in stages else "mapping"]["facts"]["names"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     if not math.isfinite(error):
