@@ -19,7 +19,6 @@ from gsplat_edu.sfm.mapping import attempts, map_photos
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.result import publish, published
 from gsplat_edu.sfm.source import needs_poses
-from gsplat_edu.sfm.stages import Stages
 from lab.captures.textured_box import align_cameras, box_orbit, photograph_box
 from sfm.textured_box import LIMIT, TURNED, cameras_of, check
 
@@ -260,11 +259,9 @@ def test_photos_without_further_matches_are_not_mapped_again(likely, monkeypatch
 
 
 @pytest.fixture
-def likely(copied, monkeypatch):
+def likely(copied):
     """A copy of the finished capture, whose photos are to be matched anew in likely pairs."""
-    monkeypatch.setattr("gsplat_edu.sfm.candidates.FEW", 13)
-    Stages(copied.out / "sfm" / "stages.json", print).forget("matches")
-    return copied
+    return replace(copied, matcher="likely")
 
 
 def prepared(options, monkeypatch, pairs, first):

@@ -45,8 +45,14 @@ def test_files_are_requested_only_while_somebody_watches(page, training):
     assert scene.content == training.scene.read_bytes()
 
 
-def test_requests_wait_for_a_new_state(page, training, monkeypatch):
+@pytest.fixture
+def impatient(monkeypatch):
+    """Requests wait for a fraction of a second."""
     monkeypatch.setattr(live_routes, "WAIT", 0.2)
+
+
+@pytest.mark.usefixtures("impatient")
+def test_requests_wait_for_a_new_state(page, training, monkeypatch):
     training.path.mkdir()
     assert page.get("/api/runs/r/live/state").status_code == 204
     assert page.get("/api/runs/r/live/scene?after=-1").status_code == 204
@@ -82,8 +88,8 @@ def test_pausing_the_view_pauses_the_job(page, studio, training):
     assert page.post("/api/runs/r/live/control", content=b"{").status_code == 400
 
 
-def test_damaged_files_and_finished_runs_have_no_live_view(page, studio, training, monkeypatch):
-    monkeypatch.setattr(live_routes, "WAIT", 0.1)
+@pytest.mark.usefixtures("impatient")
+def test_damaged_files_and_finished_runs_have_no_live_view(page, studio, training):
     training.path.mkdir()
     training.state.write_text("{")
     training.scene.write_bytes(b"\xff" * 40)

@@ -489,7 +489,7 @@ class _Pair:
     @cached_property
     def difference(self) -> Float64[np.ndarray, "H W 3"]:
         """The render less the photo."""
-        return self.render - self.photo
+        return np.asarray(self.render - self.photo)
 
     def psnr(self) -> float:
         return _decibels(self._mean(np.square(self.difference)))

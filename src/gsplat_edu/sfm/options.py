@@ -10,7 +10,7 @@ from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.validation import in_range, one_of, whole_number
 from gsplat_edu.sfm.scale_text import check_scale
 
-MATCHERS = ("auto", "exhaustive", "sequential", "nearest")
+MATCHERS = ("auto", "exhaustive", "likely", "sequential", "nearest")
 
 MAPPERS = ("auto", "incremental", "global")
 
@@ -72,10 +72,10 @@ class SfmOptions:
         source: A folder of photos, or a video.
         out: Folder of the capture. Intermediate results are kept in its subfolder sfm/.
         frames: Most frames to take from a video.
-        matcher: "exhaustive": all pairs. "sequential": each photo with the following ones. "nearest": these, similar
-            photos, and photos taken nearby. "auto": for photos in sequence, from 60 on, the pairs of a video; otherwise
-            exhaustive up to 59 photos, up to 400 the pairs that share large features, else nearest; nearest for videos;
-            for panoramas exhaustive up to 150 faces.
+        matcher: "exhaustive": all pairs. "likely": the pairs that share large features. "sequential": each photo with
+            the following ones. "nearest": these, similar photos, and photos taken nearby. "auto": for photos in
+            sequence, from 60 on, the pairs of a video; otherwise exhaustive up to 59 photos, likely up to 400, else
+            nearest; nearest for videos; for panoramas exhaustive up to 150 faces.
         mapper: "incremental", "global", or "auto": incremental, then global if its result is insufficient.
         camera_model: COLMAP's name of the lens model; "auto": SIMPLE_RADIAL, or SIMPLE_RADIAL_FISHEYE for fisheyes, or
             a model with more parameters if the photos support it. A fisheye's field of view may follow, as in

@@ -431,7 +431,7 @@ class _Run:
             )
         verified = self._match_pairs(chosen)
         part = self._connected(verified)
-        if len(part) < count and self.options.matcher == "auto" and kind != "exhaustive":
+        if len(part) < count and self.options.matcher in ("auto", "likely") and kind != "exhaustive":
             # Neighbours in the sequence and similar photos did not connect all photos: try more pairs of the others.
             chosen |= candidates.farther(kind, part)
             verified = self._match_pairs(chosen)

@@ -131,8 +131,7 @@ def find_masks(gaussians: Gaussians, views: Sequence[View], how: Compared) -> li
     Raises:
         DatasetError: a photo cannot be read.
     """
-    # On one thread, torch's bits do not depend on their number, and no thread waits between these small operations.
-    with torch.no_grad(), one_thread():
+    with torch.no_grad():
         return _found(gaussians, views, how)
 
 
@@ -230,14 +229,16 @@ def _residual(
         counts = photo.opaque if counts is None else counts & photo.opaque
         backdrop = Backdrop(output.transmittance.detach(), how.settings.background)
     mask = None if counts is None else torch.from_numpy(counts).to(image.device)
-    gains = measured_gains(image, torch.from_numpy(truth).to(image.device), mask)
-    image = recolored(image, color_matrix(gains), None, backdrop)
+    with one_thread():  # the rounding of torch's sums depends on the number of threads
+        gains = measured_gains(image, torch.from_numpy(truth).to(image.device), mask)
+        image = recolored(image, color_matrix(gains), None, backdrop)
     pixels = truth.astype(np.float32) / (255.0 if truth.dtype == np.uint8 else 1.0)
     error = smoothed_difference(image.clamp(0.0, 1.0).float().numpy(force=True), pixels, photo.mask)
     known = np.isfinite(error)
     planes = np.stack([np.nan_to_num(error), known.astype(np.float32)], axis=-1)
-    # As a sum: given the planes as the gradient, torch would import sympy first, which takes seconds.
-    (sums,) = torch.autograd.grad((output.features * torch.from_numpy(planes).to(probe)).sum(), probe)
+    with torch.enable_grad():  # a sum: given the planes as its gradient, torch would import sympy, in seconds
+        whole = (output.features * torch.from_numpy(planes).to(probe)).sum()
+    (sums,) = torch.autograd.grad(whole, probe)
     found = sums.float().numpy(force=True)
     shown = np.flatnonzero(found[:, 1] > LEAST_WEIGHT)
     return error, shown, found[shown, 0] / found[shown, 1]
