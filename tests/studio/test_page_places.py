@@ -128,25 +128,32 @@ def test_whose_poses_are_read_is_chosen_where_several_programs_left_some(visitor
     tab.reload()
     tab.get_by_label("Cameras from").wait_for()
     assert tab.get_by_label("Cameras from").input_value() == "any name.nvm"
+    (folder / "any name.nvm").unlink()
+    tab.reload()
+    tab.get_by_text("The cameras that were chosen are gone. Choose others.").wait_for()
+    select.select_option("the file that train reads by itself")
+    tab.get_by_text("Poses of OpenSfM: 6 of 6 photos").wait_for()
+    assert select.is_hidden() and not (folder / CHOSEN).exists()
 
 
 def test_only_files_with_poses_can_be_chosen(page, studio):
     folder = studio.library.root / "captures" / "both"
     write_opensfm(folder)
     address = "/api/captures/both/poses"
-    assert page.get(address).json() == {"files": [], "chosen": None}
+    assert page.get(address).json() == {"files": [], "chosen": None, "lost": False}
     write_nvm(folder, CAMERAS[:4])
     files = [
         {"file": "any name.nvm", "program": "VisualSFM"},
         {"file": "reconstruction.json", "program": "OpenSfM"},
     ]
-    assert page.get(address).json() == {"files": files, "chosen": None}
+    assert page.get(address).json() == {"files": files, "chosen": None, "lost": False}
     for wrong in ("images/shot_0.png", "../x", "/etc/passwd"):
         refused = page.post(address, json={"file": wrong})
         assert refused.status_code == 400 and "is no file with poses" in refused.json()["error"]
     assert page.post(address, json={"file": "reconstruction.json"}).status_code == 200
-    assert page.get(address).json() == {"files": files, "chosen": "reconstruction.json"}
-    (folder / CHOSEN).write_text("gone.xml")
-    assert page.get(address).status_code == 422
+    assert page.get(address).json() == {"files": files, "chosen": "reconstruction.json", "lost": False}
+    (folder / "any name.nvm").unlink()
+    (folder / CHOSEN).write_text("any name.nvm")
+    assert page.get(address).json() == {"files": files[1:], "chosen": None, "lost": True}
     assert page.post(address, json={"file": ""}).status_code == 200
     assert page.get(address).json()["chosen"] is None and not (folder / CHOSEN).exists()

@@ -93,15 +93,13 @@ def _poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # no
     entry = studio.library.entry("captures", request.path_params["name"])
     files = [{"file": file, "program": program} for file, program in pose_choices(entry)]
     has_choice = len(files) + (find_model(entry) is not None) > 1
-    try:
-        chosen = chosen_poses(entry)
-    except DatasetError as error:
-        raise RefusedError(str(error), HTTPStatus.UNPROCESSABLE_ENTITY) from None
-    is_chosen = (entry / CHOSEN).is_file()
-    return {
-        "files": files if has_choice else [],
-        "chosen": chosen.relative_to(entry).as_posix() if is_chosen else None,
-    }
+    chosen, is_lost = None, False
+    if (entry / CHOSEN).is_file():
+        try:
+            chosen = chosen_poses(entry).relative_to(entry).as_posix()
+        except DatasetError:
+            is_lost = True
+    return {"files": files if has_choice or is_lost else [], "chosen": chosen, "lost": is_lost}
 
 
 def _choose_poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

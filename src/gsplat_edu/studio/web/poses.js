@@ -30,7 +30,7 @@ export function poses(entry, chosen) {
   const found = versioned(
     line,
     () => get(at(entry.entry, "poses")),
-    ({ files, chosen: file }) => {
+    ({ files, chosen: file, lost }) => {
       element.hidden = !files.length;
       const usual = want("option", { value: "" }, "the file that train reads by itself");
       const options = files.map(({ file: value, program }) =>
@@ -38,6 +38,8 @@ export function poses(entry, chosen) {
       );
       patch(select, [usual, ...options]);
       select.value = file ?? "";
+      if (lost) select.selectedIndex = -1;
+      put(line, lost ? "The cameras that were chosen are gone. Choose others." : "");
     },
   );
   return { element, read: (now) => found.read(now.modified) };
