@@ -32,7 +32,7 @@ LENGTH = 512.0
 NOTHING: Float32[np.ndarray, "0 128"] = np.zeros((0, 128), np.float32)
 
 
-def largest_features(database: Path, names: Sequence[str]) -> list[Float32[np.ndarray, "m 128"]]:
+def largest_features(database: Path, names: Sequence[str]) -> list[Float32[np.ndarray, "_ 128"]]:
     """Read the SIFT descriptors of each photo's `LARGEST` features of the largest scales.
 
     Args:
@@ -63,7 +63,7 @@ def _of_largest_scales(
 
 
 def votes(
-    described: Sequence[Float32[np.ndarray, "m 128"]], progress: Callable[[int], None] = lambda done: None
+    described: Sequence[Float32[np.ndarray, "_ 128"]], progress: Callable[[int], None] = lambda done: None
 ) -> Int64[np.ndarray, "n n"]:
     """Count the matches between the descriptors of each two photos.
 

@@ -61,7 +61,7 @@ def shape_of(mask: Bool[np.ndarray, "h w"]) -> Shape:
     return Shape(kept / mask.size, float(border.mean()), largest / max(kept, 1))
 
 
-def outside_masks_for(masks: Sequence[Bool[np.ndarray, "h w"]], photos: int) -> Remedy:
+def outside_masks_for(masks: Sequence[Bool[np.ndarray, "_ _"]], photos: int) -> Remedy:
     """Choose `--outside-masks` for a capture.
 
     Args:
