@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -241,8 +240,7 @@ def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
         check_shape("image", given.shape, ("H", "W", 3), {})
         return given
     values = np.clip(float64_array("image", given, ("H", "W", 3)), 0.0, 1.0)
-    rounded: UInt8[np.ndarray, "H W 3"] = np.floor(255.0 * values + 0.5).astype(np.uint8)
-    return rounded
+    return _levels(values).astype(np.uint8)
 
 
 def score_image(
@@ -390,7 +388,7 @@ def score_views(
     """
     scores = list[ImageScore]()
 
-    def told(view: View, photo: Photo, output: RenderOutput, scored: Future[ImageScore]) -> None:
+    def tell(view: View, photo: Photo, output: RenderOutput, scored: Future[ImageScore]) -> None:
         scores.append(scored.result())
         if on_score is not None:
             on_score(view, scores[-1])
@@ -407,10 +405,10 @@ def score_views(
                 output = render(gaussians, view.camera)
             scored = worker.submit(score_photo, view.name, photo, output, background)
             if waiting is not None:
-                told(*waiting)
+                tell(*waiting)
             waiting = view, photo, output, scored
         if waiting is not None:
-            told(*waiting)
+            tell(*waiting)
     return scores
 
 
@@ -446,6 +444,13 @@ def best(scores: Sequence[ImageScore]) -> ImageScore:
     if not scores:
         raise ArgumentError("scores: is empty; score at least one view")
     return max(scores, key=lambda score: score.psnr)
+
+
+def _levels(values: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "H W 3"]:
+    """Round values from 0 to 1 to whole levels from 0 to 255."""
+    levels = 255.0 * values
+    levels += 0.5
+    return np.asarray(np.floor(levels, out=levels))
 
 
 def _as_array(image: ArrayLike) -> np.ndarray:
@@ -486,18 +491,12 @@ class _Pair:
             if not self.counts.any():
                 raise ArgumentError("mask: no pixel counts; leave the image out")
 
-    @cached_property
-    def difference(self) -> Float64[np.ndarray, "H W 3"]:
-        """The render less the photo."""
-        return np.asarray(self.render - self.photo)
-
     def psnr(self) -> float:
-        return _decibels(self._mean(np.square(self.difference)))
+        error = self.render - self.photo
+        return _decibels(self._mean(np.square(error, out=error)))
 
     def psnr_8bit(self) -> float:
-        error = 255.0 * self.render
-        error += 0.5
-        np.floor(error, out=error)
+        error = _levels(self.render)
         error /= 255.0
         error -= self.photo
         return _decibels(self._mean(np.square(error, out=error)))
@@ -535,7 +534,8 @@ class _Pair:
         return float(np.log(render / photo).max())
 
     def l1(self) -> float:
-        return self._mean(np.abs(self.difference))
+        error = self.render - self.photo
+        return self._mean(np.abs(error, out=error))
 
     def _mean(self, errors: Float64[np.ndarray, "H W 3"]) -> float:
         return float((errors if self.counts is None else errors[self.counts]).mean())
