@@ -10,6 +10,9 @@ from pathlib import Path
 # One thread, because several processes run tests at once, and threads that wait for one another waste CPU time. Tests
 # of several threads set their number. This has to precede the import of torch; programs that tests start inherit it.
 os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["OMP_WAIT_POLICY"] = (
+    "PASSIVE"  # the threads of those tests sleep instead of spinning on a busy core
+)
 
 import jaxtyping
 import numpy as np

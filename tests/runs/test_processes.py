@@ -213,7 +213,10 @@ of the next step, so the run cannot end before.
 
 
 @pytest.mark.own_process
-@pytest.mark.parametrize(("size", "victim"), [(2, 0), (2, 1), (4, None), (4, 3)])
+@pytest.mark.parametrize(
+    ("size", "victim"),
+    [*(pytest.param(*case, marks=pytest.mark.soak) for case in ((2, 0), (4, None))), (2, 1), (4, 3)],
+)
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0
     out, program = tmp_path / "several", tmp_path / "program.py"
@@ -285,17 +288,20 @@ def test_the_first_process_gives_the_start_points(capture, tmp_path):
             ["train", "CAPTURE", "--batch", "3"],
             "gsplat-edu train: --batch: is 3, but has to be a multiple of the 2 ",
         ),
-        (
+        pytest.param(
             ["train", "CAPTURE", "--batch", "2", "--time-limit", "9s"],
             "gsplat-edu train: --time-limit: cannot choose",
+            marks=pytest.mark.soak,
         ),
-        (
+        pytest.param(
             ["train", "CAPTURE", "--batch", "2", "--view"],
             "gsplat-edu train: --view: shows the training of one process",
+            marks=pytest.mark.soak,
         ),
-        (
+        pytest.param(
             ["train", "CAPTURE", "--batch", "two"],
             "gsplat-edu train: argument --batch: 'two' is not a whole number",
+            marks=pytest.mark.soak,
         ),
         (["doctor", "CAPTURE"], "gsplat-edu: doctor: runs in one process"),
     ],
