@@ -56,6 +56,7 @@ def train(folder: Path, limit: list[str]) -> dict[str, Any]:
     return {
         "limit": " ".join(limit[:2]),
         "seconds": seconds,
+        "processor_seconds": usage.ru_utime + usage.ru_stime,
         "peak_rss": 1024 * usage.ru_maxrss,
         "forecast": forecast(text),
         "said": [line for line in text.splitlines() if "forecast" in line or "chosen" in line],
