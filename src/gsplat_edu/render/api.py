@@ -9,6 +9,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.derivatives import opaque, refuse_vmap
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.validation import ArrayLike, Shape, check_shape, float64_array, of_type
@@ -53,6 +54,7 @@ def render(
 ) -> RenderStack: ...
 
 
+@opaque
 def render(
     gaussians: Gaussians,
     camera: CameraLike | CameraTensors | Sequence[CameraLike | CameraTensors],
@@ -93,6 +95,7 @@ def render(
     Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """
     of_type("gaussians", gaussians, Gaussians)
+    refuse_vmap("render in a loop, or give render several cameras")
     settings = RenderSettings() if settings is None else settings
     of_type("settings", settings, RenderSettings)
     chosen = backend if isinstance(backend, Backend) else load_backend(backend, gaussians.means.device)

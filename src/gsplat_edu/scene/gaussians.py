@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsplat_edu.base.derivatives import refuse_halves
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import Shape, check_shape, first_index, quoted
 
@@ -31,7 +32,7 @@ class Gaussians:
 
     Raises:
         ShapeError: a shape differs, or the parameters have different N.
-        ArgumentError: a parameter is not a float tensor of the same dtype and device as the means.
+        ArgumentError: a parameter is not a float32 or float64 tensor of the same dtype and device as the means.
     """
 
     means: Float[Tensor, "N 3"]
@@ -47,6 +48,7 @@ class Gaussians:
         for name, tensor in given.items():
             if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
                 raise ArgumentError(f"{name}: has to be a float tensor, got {type(tensor).__name__}")
+            refuse_halves(name, tensor)
             if (tensor.dtype, tensor.device) != (self.means.dtype, self.means.device):
                 wanted = f"{self.means.dtype} on {self.means.device}"
                 raise ArgumentError(f"{name}: is {tensor.dtype} on {tensor.device}, but means are {wanted}")

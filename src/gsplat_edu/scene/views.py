@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -52,7 +53,7 @@ class View:
     ) -> None:
         photo = Photo(image, alpha, mask)
         check_shape("image", photo.image.shape, (camera.H, camera.W, 3), {})
-        self._set(camera, name, lambda: photo, on_disk=False)
+        self._set(camera, name, partial(_kept, photo), on_disk=False)
 
     @classmethod
     def stored(cls, camera: Camera, read: Callable[[], Photo], name: str = "") -> View:
@@ -60,7 +61,7 @@ class View:
 
         Args:
             camera: The camera.
-            read: Returns the photo, of the camera's size.
+            read: Returns the photo, of the camera's size. Other processes get the view only if this can be pickled.
             name: The view's name in the capture.
         """
         view = cls.__new__(cls)
@@ -96,9 +97,8 @@ class View:
         if factor == 1.0:
             return self
         W, H = (max(1, round(side / factor)) for side in (self.camera.W, self.camera.H))
-        return View.stored(self.camera.scaled(W, H), lambda: self.read().scaled(W, H), self.name).with_depth(
-            self.depth
-        )
+        read = partial(read_scaled, self, W, H)
+        return View.stored(self.camera.scaled(W, H), read, self.name).with_depth(self.depth)
 
     def _set(
         self,
@@ -116,3 +116,18 @@ class View:
     def image(self) -> Pixels:
         """RGB of the photo, (H, W, 3)."""
         return self.read().image
+
+
+def _kept(photo: Photo) -> Photo:
+    return photo
+
+
+def read_scaled(view: View, W: int, H: int) -> Photo:
+    """Read the photo of a view, at another size.
+
+    Args:
+        view: The view.
+        W: Width, px; at most the photo's.
+        H: Height, px; at most the photo's.
+    """
+    return view.read().scaled(W, H)

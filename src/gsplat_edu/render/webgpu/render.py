@@ -143,6 +143,7 @@ def engine_view(
     )  # fmt: skip
 
 
+@first_derivative_only("backend 'webgpu'", 'backend="torch"')
 class _Rasterize(torch.autograd.Function):
     """The complete renderer as one differentiable operation."""
 
@@ -170,7 +171,6 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, depth, mixed, median
 
     @staticmethod
-    @first_derivative_only("backend 'webgpu'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, transmittance, *parameters = ctx.saved_tensors
         call: _Call = ctx.call
