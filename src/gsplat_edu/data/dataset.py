@@ -65,7 +65,7 @@ ONE_PLACE = 1e-5
 """Largest distance of two centres that count as one, as a fraction of the cameras' spread."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """A capture, ready for training.
 
@@ -159,6 +159,11 @@ class Dataset:
             placed.cloud is not None,
             region,
         )
+
+    def __repr__(self) -> str:
+        """Return one line: layout, path, and numbers of views and points."""
+        views = f"{len(self.train)} training and {len(self.test)} test views"
+        return f"Dataset({self.layout}, {str(self.path)!r}, {views}, {len(self.points):,} points)"
 
     def torch(
         self,

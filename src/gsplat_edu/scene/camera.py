@@ -68,7 +68,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Floa
     return np.stack([right, np.cross(forward, right), forward])
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class Camera:
     """A camera in OpenCV axes: a pinhole, unless it has another projection.
 
@@ -126,6 +126,14 @@ class Camera:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        """Return one line: size, lens and shutter, focal lengths, principal point and centre."""
+        lens = "pinhole" if self.pinhole else self.projection.kind
+        read = "" if self.shutter is None else f" read {self.readout}"
+        eye = ", ".join(f"{x:.4g}" for x in self.eye)
+        numbers = f"fx={self.fx:.4g}, fy={self.fy:.4g}, cx={self.cx:.4g}, cy={self.cy:.4g}"
+        return f"Camera({self.W}x{self.H} px, {lens}{read}, {numbers}, eye=({eye}))"
 
     def through(self, projection: Projection = PINHOLE, shutter: RollingShutter | None = None) -> Camera:
         """Return this camera with another lens and shutter.

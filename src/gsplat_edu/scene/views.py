@@ -15,7 +15,7 @@ from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.scene.photo import Photo, Pixels
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class View:
     """A camera and its photo, in memory or still on disk.
 
@@ -54,6 +54,11 @@ class View:
         photo = Photo(image, alpha, mask)
         check_shape("image", photo.image.shape, (camera.H, camera.W, 3), {})
         self._set(camera, name, partial(_kept, photo), on_disk=False)
+
+    def __repr__(self) -> str:
+        """Return one line: name, size, and where the photo is."""
+        where = "on disk" if self.on_disk else "in memory"
+        return f"View({self.name!r}, {self.camera.W}x{self.camera.H} px, {where})"
 
     @classmethod
     def stored(cls, camera: Camera, read: Callable[[], Photo], name: str = "") -> View:
