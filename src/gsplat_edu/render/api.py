@@ -94,7 +94,7 @@ def render(
 
     Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """
-    of_type("gaussians", gaussians, Gaussians)
+    _check_gaussians(gaussians)
     refuse_vmap("render in a loop, or give render several cameras")
     settings = RenderSettings() if settings is None else settings
     of_type("settings", settings, RenderSettings)
@@ -112,6 +112,13 @@ def render(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
     return _stack(tuple(_render_one(chosen, gaussians, c, settings, extra) for c in cameras))
+
+
+def _check_gaussians(given: object) -> None:
+    """Check that Gaussians are given, and not what holds them: a scene, or a trainer."""
+    if isinstance(getattr(given, "gaussians", None), Gaussians):
+        raise ArgumentError(f"gaussians: is a {type(given).__name__}; give its Gaussians, .gaussians")
+    of_type("gaussians", given, Gaussians)
 
 
 def _extra(
@@ -198,7 +205,7 @@ def _render_one(
         require_memory(
             f"an image of {camera.W}x{camera.H} px",
             (BYTES_PER_PIXEL + BYTES_PER_CHANNEL * channels) * int(camera.W) * int(camera.H),
-            "close other programs, or render fewer pixels (--size)",
+            "close other programs, or render at a smaller `size`",
         )
     if not camera.pinhole:
         backend.require("lens", "camera: its projection or rolling shutter")
