@@ -1,6 +1,8 @@
 import inspect
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -86,3 +88,59 @@ def test_every_public_object_has_a_docstring():
 def test_importing_the_package_does_not_import_torch():
     code = "import sys, gsplat_edu; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+USER = """
+from pathlib import Path
+
+import torch
+from gsplat_edu import Camera, Gaussians, Scene, load_backend, load_dataset, read_scene, recipe, training, write_scene
+from gsplat_edu.data.torch_dataset import ViewDataset
+from gsplat_edu.mesh.extract import mesh_of
+from gsplat_edu.ops.losses import photo_loss
+from gsplat_edu.render.api import render
+from gsplat_edu.scene.mesh import Mesh
+
+
+def step(gaussians: Gaussians, camera: Camera, photo: torch.Tensor) -> float:
+    output = render(gaussians, camera)
+    loss = photo_loss(output.image, photo)
+    loss.backward()  # type: ignore[no-untyped-call]
+    output.save(Path("a.png"))
+    return float(loss)
+
+
+def made(folder: Path) -> tuple[Scene, Mesh, ViewDataset]:
+    dataset = load_dataset(folder)
+    trainer = training(recipe(30), dataset, load_backend())
+    losses: list[float] = trainer.run().losses
+    print(len(losses), trainer)
+    write_scene("a.ply", trainer.gaussians[trainer.gaussians.opacities > 0.1])
+    return read_scene("a.ply"), mesh_of(trainer.gaussians), dataset.torch("train", crop=(8, 8))
+
+
+wrong: int = render(Gaussians, 3)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.own_process
+def test_a_users_file_is_typed(tmp_path):
+    """The package has annotations for users (py.typed): the one mistake in a file is found, and nothing else."""
+    (tmp_path / "user.py").write_text(USER)
+    source = Path(gsplat_edu.__file__).parent
+    assert (source / "py.typed").is_file()
+    words = ["--strict", "--follow-imports=silent", f"--cache-dir={tmp_path / 'cache'}", "user.py"]
+    found = subprocess.run(
+        [sys.executable, "-m", "mypy", *words],
+        cwd=tmp_path,
+        env=os.environ | {"MYPYPATH": str(source.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    lines = [line for line in found.stdout.splitlines() if ": error: " in line]
+    number = 1 + USER.splitlines().index("wrong: int = render(Gaussians, 3)")
+    assert lines and all(line.startswith(f"user.py:{number}: ") for line in lines), (
+        found.stdout + found.stderr
+    )

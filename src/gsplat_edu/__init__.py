@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from gsplat_edu.base import pictures as _pictures
 from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, C0, C1, C2, C3, DILATION, T_STOP, TILE, Z_NEAR
 from gsplat_edu.base.errors import ArgumentError, BackendUnavailableError, ShapeError, SplatError
 from gsplat_edu.render.numpy_reference import render_gaussians
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from gsplat_edu.train.config import recipe
 
 __version__ = "0.1.0"
+
+_pictures.scenes_shown_by("gsplat_edu.viewer.notebook")
 
 LAZY = {
     "Gaussians": "scene.gaussians",

@@ -99,7 +99,7 @@ def test_a_process_with_little_memory_left(tmp_path):
     )
     assert re.fullmatch(
         r"gsplat-edu render: an image of 200000x200000 px: needs [\d,.]+ GiB of memory, but only 0\.\d\d GiB are free; "
-        r"close other programs, or render fewer pixels \(--size\)",
+        r"close other programs, or render at a smaller --size",
         second,
     )
     assert re.fullmatch(

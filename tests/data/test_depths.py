@@ -73,9 +73,7 @@ def test_a_wrong_unit_and_a_wrong_kind_are_refused_in_one_line(tmp_path):
     ):
         given(folder, DepthSource(maps, "ray"))
     inverse = write_maps(tmp_path / "inverse", lambda depth, view: 1 / np.maximum(depth, 0.1), 20_000)
-    with pytest.raises(
-        DatasetError, match="neither z nor ray length in any unit.*add --set depth_kind=inverse"
-    ):
+    with pytest.raises(DatasetError, match="neither z nor ray length in any unit.*take `depth_kind=inverse`"):
         given(folder, DepthSource(inverse))
     with pytest.raises(DatasetError, match="larger values are farther away"):
         given(folder, DepthSource(maps, "inverse"))
@@ -152,7 +150,7 @@ def test_without_points_the_unit_has_to_be_named(tmp_path):
     contents = json.loads((folder / "transforms.json").read_text())
     del contents["ply_file_path"]
     (folder / "transforms.json").write_text(json.dumps(contents))
-    with pytest.raises(DatasetError, match="too few to find its unit; name it with --set depth_unit=U"):
+    with pytest.raises(DatasetError, match="too few to find its unit; name it with `depth_unit=U`"):
         given(folder, DepthSource(maps))
     dataset, report = given(folder, DepthSource(maps, unit=0.001))
     assert report.fit.points == 0 and "unchecked" in report.lines()[0]
@@ -265,5 +263,5 @@ def right_share(samples, camera, exact):
 
 
 def test_a_scan_has_to_be_named(tmp_path):
-    with pytest.raises(DatasetError, match="takes the depth from the scan that --points names"):
+    with pytest.raises(DatasetError, match="^depth: comes from the scan that `points` names"):
         given(write_capture(tmp_path, "transforms"), DepthSource(SCAN))

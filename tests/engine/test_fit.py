@@ -47,17 +47,17 @@ def test_the_line_names_what_fits_and_the_remedy():
     line = why_too_large(program, counts_of(10**6, 3), DEFAULT, "A")
     assert line.startswith("the buffer rest needs 172 MiB for 1000000 gaussians, ")
     assert line.endswith(
-        "but A allows 128: 745654 gaussians fit; all fit with --sh-degree 2 (train, convert); train with a lower "
-        "--max-gaussians or --sh-degree, reduce the scene"
+        "but A allows 128: 745654 gaussians fit; all fit with `sh_degree=2`; train with a lower "
+        "`max_gaussians` or `sh_degree`, reduce the scene"
     )
     line = why_too_large(program, counts_of(3 * 10**6, 3), DEFAULT, "A")
-    assert "745654 gaussians fit; train with a lower --max-gaussians or --sh-degree" in line
+    assert "745654 gaussians fit; train with a lower `max_gaussians` or `sh_degree`" in line
     line = why_too_large(program, counts_of(3 * 10**6, 0), DEFAULT, "A")
-    assert "2097152 gaussians fit; train with a lower --max-gaussians, reduce" in line
+    assert "2097152 gaussians fit; train with a lower `max_gaussians`, reduce" in line
     line = why_too_large(program, counts_of(10, 0, pairs=4 * 10**6), DEFAULT, "A")
-    assert "3355443 pairs fit; make the image smaller (--resolution, --size), lower --max-gaussians" in line
+    assert "3355443 pairs fit; make the image smaller (`resolution`, `size`), lower `max_gaussians`" in line
     line = why_too_large(program, counts_of(10, 0, pixels=4 * 10**6), DEFAULT, "A")
-    assert "3728270 pixels fit; make the image smaller (--resolution, --size)" in line
+    assert "3728270 pixels fit; make the image smaller (`resolution`, `size`)" in line
 
 
 @pytest.mark.parametrize("count", [364, 365])
@@ -70,7 +70,7 @@ def test_as_many_as_the_line_names_are_drawn_and_one_more_is_refused(count):
         assert len(draw_frame(pool, packed(scene), view_of(scene)).visible) > 0
     else:
         with pytest.raises(
-            BackendUnavailableError, match=r": 364 gaussians fit; all fit with --sh-degree 2"
+            BackendUnavailableError, match=r": 364 gaussians fit; all fit with `sh_degree=2`"
         ) as raised:
             draw_frame(pool, packed(scene), view_of(scene))
         assert re.fullmatch(r"backend 'webgpu': .*, or use the backend cpu", str(raised.value))
@@ -105,7 +105,7 @@ def test_commands_say_it_in_one_line_and_write_nothing(tmp_path, capsys):
     command = ["render", str(tmp_path / "a.ply"), "--frames", "1", "--size", "20", "--backend", "webgpu"]
     assert main([*command, "--out", str(tmp_path / "frames")]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert "1456 gaussians fit; all fit with --sh-degree 2 (train, convert)" in line
+    assert "1456 gaussians fit; all fit with --sh-degree 2; train with a lower --max-gaussians" in line
     write_colmap(tmp_path / "egg", *procedural_capture(120, 4, splats=80))
     command = ["train", str(tmp_path / "egg"), "--out", str(tmp_path / "run"), "--backend", "webgpu"]
     assert main([*command, "--iterations", "5"]) == 2

@@ -189,7 +189,7 @@ def test_a_device_that_is_lost_again_and_again_ends_the_run_and_its_checkpoint_c
     lose(losable)
     with pytest.raises(
         DeviceLostError,
-        match="was lost 3 times .* --resume",
+        match="was lost 3 times .*; resume from the last checkpoint",
     ) as raised:
         run.run()
     assert "\n" not in str(raised.value) and len(devices) == 2

@@ -12,8 +12,9 @@ from gsplat_edu.base.errors import NotEnoughMemoryError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.evaluate.surface import Comparison, score_surface
 from gsplat_edu.evaluate.topology import topology
+from gsplat_edu.io.mesh_files import write_mesh
 from gsplat_edu.mesh.depths import DepthView, checked, neighbours_of, render_depths
-from gsplat_edu.mesh.extract import MeshSettings, cut_surface, extract_mesh
+from gsplat_edu.mesh.extract import MeshSettings, cut_surface, extract_mesh, mesh_of
 from gsplat_edu.mesh.plan import PIXEL_BYTES, default_voxel
 from gsplat_edu.mesh.tidy import TidySettings
 from gsplat_edu.mesh.trust import seen_by
@@ -155,7 +156,7 @@ def test_voxels_grow_until_the_surface_has_few_triangles(result):
     )
     assert any(f"at most {most:,} triangles" in note for note in small.notes)
     assert list(dict.fromkeys(stages)) == ["depth maps", "checks", "volume", "triangles", "tidying"]
-    with pytest.raises(NotEnoughMemoryError, match=f"the memory has room for {most:,}; take a --voxel of"):
+    with pytest.raises(NotEnoughMemoryError, match=f"the memory has room for {most:,}; take a `voxel` of"):
         settings = MeshSettings(voxel=result.voxel, most_faces=most)
         extract_mesh(ball(), orbit(), SETTINGS, load_backend("cpu"), settings)
 
@@ -211,3 +212,20 @@ def test_noise_does_not_shrink_a_sphere(deviation):
     cut = cut_surface(noisy_sphere(deviation * voxel), voxel, MeshSettings(voxel=voxel), lambda *step: None)
     radii = np.linalg.norm(cut.raw.vertices, axis=1)
     assert abs(radii.mean() - 1.0) < 0.12 * voxel
+
+
+def test_gaussians_of_ones_own_become_a_mesh_in_one_call(as_shipped, tmp_path):
+    """Without cameras, orbits around three axes see the whole ball; with trainable Gaussians, nothing is recorded."""
+    mesh = mesh_of(ball().trainable(), settings=MeshSettings(voxel=0.04))
+    shape = topology(mesh)
+    assert shape.components == 1 and shape.boundary_edges == 0
+    off = np.linalg.norm(mesh.vertices, axis=1) - RADIUS
+    assert np.abs(off).mean() < 0.02 and np.abs(off).max() < 0.06
+    write_mesh(tmp_path / "ball.glb", mesh)
+    assert (tmp_path / "ball.glb").stat().st_size > 1000
+    seen = mesh_of(ball(), [camera for _, camera in orbit()[:1]], render_settings=SETTINGS)
+    assert topology(seen).boundary_edges > 0, "one camera sees one side"
+    with pytest.raises(ArgumentError, match="at least one camera"):
+        mesh_of(ball(), [])
+    with pytest.raises(ArgumentError, match=r"^cameras\[0\]: is not a camera"):
+        mesh_of(ball(), ["first"])

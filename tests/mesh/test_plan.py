@@ -48,7 +48,7 @@ def test_voxels_are_chosen_for_the_memory(limit):
     ("demand", "free", "said"),
     [
         (Demand(), 700 * MIB, "memory: 100 depth maps need 715 MiB, but 700 MiB are free"),
-        (Demand(memory=1100 * MIB), None, "need 1.14 GiB, but 1.07 GiB are allowed by --max-memory"),
+        (Demand(memory=1100 * MIB), None, "need 1.14 GiB, but 1.07 GiB are allowed by `max_memory`"),
         (Demand(texture=True), 1500 * MIB, "100 depth maps and a texture need 1.58 GiB"),
         (Demand(), 720 * MIB, "voxel: 0.01 needs about"),
         (Demand(voxel=0.001), 8 * 2**30, "voxel: 0.001 needs about"),
@@ -63,7 +63,7 @@ def test_what_cannot_fit_is_one_line(demand, free, said):
 def test_the_advised_voxel_fits():
     with pytest.raises(NotEnoughMemoryError) as error:
         plan_mesh(ROOM, Demand(voxel=0.001), 8 * 2**30)
-    advised = 1.05 * float(str(error.value).rsplit(" ", 1)[1])  # two digits are told
+    advised = 1.05 * float(str(error.value).rstrip("`").rsplit("=", 1)[1])  # two digits are told
     assert plan_mesh(ROOM, Demand(voxel=advised), 8 * 2**30).memory < 8 * 2**30
 
 

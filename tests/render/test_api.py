@@ -7,6 +7,8 @@ import torch
 from gsplat_edu import (
     ArgumentError,
     BackendUnavailableError,
+    Camera,
+    Scene,
     build_cov3d_batch,
     eval_sh,
     quat_to_R_batch,
@@ -84,3 +86,19 @@ def test_a_value_that_is_not_finite_is_refused_by_parameter_name(random_camera, 
     gaussians.tensors()[name].view(4, -1)[2, 0] = float("nan")
     with pytest.raises(ArgumentError, match=rf"^{name}\[2"):
         render(gaussians, random_camera, backend="torch")
+
+
+def test_a_scene_instead_of_gaussians_is_told_what_to_give(as_shipped, random_camera):
+    with pytest.raises(ArgumentError, match=r"^gaussians: is a Scene; give its Gaussians, \.gaussians$"):
+        render(Scene(scene()), random_camera)
+    with pytest.raises(ArgumentError, match="^gaussians: is .* but has to be of type Gaussians$"):
+        render("scene.ply", random_camera)
+
+
+def test_a_camera_of_other_matrices_never_guesses_half_a_pixel():
+    K = np.array([[75.0, 0, 32], [0, 75, 32], [0, 0, 1]])
+    with pytest.raises(TypeError, match="first_pixel"):
+        Camera.from_viewmat(np.eye(4), K, 64, 64)
+    for first in (0.0, 0.5):
+        camera = Camera.from_viewmat(np.eye(4), K, 64, 64, first_pixel=first)
+        assert (camera.cx, camera.cy) == (32 - first, 32 - first)

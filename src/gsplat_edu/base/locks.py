@@ -1,4 +1,8 @@
-"""One writer per folder: a lock that the operating system releases whenever its process ends, even by a kill."""
+"""Locks of folders and of threads.
+
+A folder has one writer; the operating system releases its lock whenever the process ends, even by a kill. A lock of
+threads belongs to one process: copies in others are free.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,9 @@ import re
 import socket
 import stat
 import sys
+import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +33,43 @@ POLL = 0.1
 """Seconds between two checks of another process or thread: its lock, its files, whether it runs."""
 
 _held: set[int] = set()
+
+
+class ThreadLock:
+    """A lock of the threads of one process.
+
+    What holds it can be pickled, and used after a fork: the copy's lock is a new one, and free. A plain lock cannot be
+    pickled, and stays locked for ever in a process that was forked while another thread held it.
+    """
+
+    def __init__(self) -> None:
+        self.renew()
+        _thread_locks.add(self)
+
+    def renew(self) -> None:
+        """Replace the lock by a new one, in a process that has none of the threads that might hold it."""
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+    def __reduce__(self) -> tuple[type[ThreadLock], tuple[()]]:
+        return ThreadLock, ()
+
+
+_thread_locks: weakref.WeakSet[ThreadLock] = weakref.WeakSet()
+
+
+def _renew_all() -> None:
+    for lock in list(_thread_locks):
+        lock.renew()
+
+
+if hasattr(os, "register_at_fork"):  # Windows does not fork
+    os.register_at_fork(after_in_child=_renew_all)
 
 
 @contextmanager

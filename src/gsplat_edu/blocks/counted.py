@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from gsplat_edu.blocks.plan import Area, Cell
@@ -111,11 +112,13 @@ def counted_views(views: Sequence[View], counted: Counted) -> tuple[View, ...]:
 def _masked(view: View, mask: Mask) -> View:
     bits, columns = np.packbits(mask, axis=1), mask.shape[1]
 
-    def read() -> Photo:
-        small = np.unpackbits(bits, axis=1, count=columns)
-        return view.read().counting(resized_mask(small.view(np.bool_), view.camera.H, view.camera.W))
-
+    read = partial(_read_masked, view, bits, columns)
     return View.stored(view.camera, read, view.name).with_depth(view.depth)
+
+
+def _read_masked(view: View, bits: UInt8[np.ndarray, "h w"], columns: int) -> Photo:
+    small = np.unpackbits(bits, axis=1, count=columns)
+    return view.read().counting(resized_mask(small.view(np.bool_), view.camera.H, view.camera.W))
 
 
 def _reduced(camera: Camera, longest: int) -> Camera:

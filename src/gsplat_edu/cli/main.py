@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import functools
 import importlib
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
-from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.printing import complain, escape_unencodable_characters
 from gsplat_edu.base.text import option_flag
@@ -92,11 +93,11 @@ def build_parser(words: Sequence[str]) -> argparse.ArgumentParser:
         if hasattr(options, "COMMON"):
             command.show_in_help(options.COMMON, options.appendix)
             command.explain_unknown = options.explain_unknown
-        command.set_defaults(run=functools.partial(_run, name))
+        command.set_defaults(run=functools.partial(_run, name, command.options_by_name()))
     return parser
 
 
-def _run(name: str, arguments: argparse.Namespace) -> None:
+def _run(name: str, flags: Mapping[str, str], arguments: argparse.Namespace) -> None:
     """Check the options, import the command, which takes seconds if it needs torch, and run it."""
     if "backend" in arguments:
         check_backend(arguments.backend)
@@ -108,22 +109,36 @@ def _run(name: str, arguments: argparse.Namespace) -> None:
         with interruptible_imports():
             command = options if name not in COMMANDS else importlib.import_module(f"gsplat_edu.cli.{module}")
         command.run(arguments)
-    except ArgumentError as error:
-        if (told := _as_option(str(error), "settings" in arguments)) == str(error):
-            raise
-        raise ArgumentError(told) from error
+    except SplatError as error:
+        told = _in_options(str(error), flags)
+        if told != str(error):
+            error.args = (told, *error.args[1:])
+        raise
 
 
-def _as_option(message: str, has_set: bool) -> str:
-    """Name the option of a setting that an error of the library names: "batch: is" becomes "--batch: is".
+def _in_options(message: str, flags: Mapping[str, str]) -> str:
+    """Name the options of what an error of the library names.
+
+    "batch: is" becomes "--batch: is"; `sky=none` in backticks becomes --sky none, or --set sky=none.
 
     Args:
         message: The error.
-        has_set: Whether the command gives settings by --set.
+        flags: The command's options by their names.
     """
     from gsplat_edu.train.config import BY_NAME  # it loads plug-ins, whose errors `main` tells
 
+    def option(name: str) -> str:
+        if name in BY_NAME and "settings" in flags:
+            return BY_NAME[name].written
+        return flags.get(name) or (option_flag(name) if name in BY_NAME else "")
+
+    def written(quoted: re.Match[str]) -> str:
+        flag, value = option(quoted["name"]), quoted["value"]
+        if not flag:
+            return quoted[0].replace("`", "")
+        return flag if value is None else f"{flag}{'=' if flag.startswith('--set ') else ' '}{value}"
+
     name, colon, rest = message.partition(": ")
-    if not colon or name not in BY_NAME:
-        return message
-    return f"{BY_NAME[name].written if has_set else option_flag(name)}: {rest}"
+    if colon and option(name):
+        message = f"{option(name)}: {rest}"
+    return re.sub(r"`(?P<name>[a-z_]+)(=(?P<value>[^`]+))?`", written, message)

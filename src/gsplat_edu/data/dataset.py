@@ -8,12 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.validation import ArrayLike, one_of
 from gsplat_edu.data.capture import Capture, Cloud, Frame, UnfitPhotoError, photo_file, whole_panoramas
 from gsplat_edu.data.images import ImageStore, PhotoFile
 from gsplat_edu.data.left_out import LEFT_OUT, is_left_out, read_left_out
@@ -53,6 +55,9 @@ from gsplat_edu.scene.rig import scene_extent as scene_extent, settled_eyes, str
 from gsplat_edu.scene.shutter import AT_ONCE
 from gsplat_edu.scene.views import View
 
+if TYPE_CHECKING:
+    from gsplat_edu.data.torch_dataset import ViewDataset
+
 TEST_EVERY = 8
 """Hold out every 8th view if the capture defines no split (the usual convention)."""
 
@@ -60,7 +65,7 @@ ONE_PLACE = 1e-5
 """Largest distance of two centres that count as one, as a fraction of the cameras' spread."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """A capture, ready for training.
 
@@ -154,6 +159,40 @@ class Dataset:
             placed.cloud is not None,
             region,
         )
+
+    def __repr__(self) -> str:
+        """Return one line: layout, path, and numbers of views and points."""
+        views = f"{len(self.train)} training and {len(self.test)} test views"
+        return f"Dataset({self.layout}, {str(self.path)!r}, {views}, {len(self.points):,} points)"
+
+    def torch(
+        self,
+        split: str = "train",
+        *,
+        crop: tuple[int, int] | None = None,
+        corner: tuple[int, int] | None = None,
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        seed: int = 0,
+    ) -> ViewDataset:
+        """Return the views of a part as a torch Dataset: images as float tensors, with their cameras.
+
+        Args:
+            split: "train" or "test".
+            crop: (height, width) px of a part of each photo; None for whole photos.
+            corner: (row, column) of the part's first pixel; None to draw it at random.
+            background: (3,) colour behind transparent photos, 0 to 1.
+            seed: Seed of the random corners; `ViewDataset.set_epoch` draws others.
+
+        Raises:
+            ArgumentError: the split has another name, a number is out of range, a photo is smaller than its part, or a
+                camera cannot be cropped.
+            ShapeError: crop, corner or background has another number of entries.
+        """
+        from gsplat_edu.data.torch_dataset import ViewDataset  # it imports torch
+
+        one_of("split", split, ("train", "test"))
+        views = self.train if split == "train" else self.test
+        return ViewDataset(views, crop=crop, corner=corner, background=background, seed=seed)
 
     def preload(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Decode every photo once, several in parallel, and keep those within the budget.

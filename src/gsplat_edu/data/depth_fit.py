@@ -184,7 +184,7 @@ def _unchecked(
         raise DepthMisfitError(
             where,
             f"{count} points lie where the maps have depth, too few to find its unit",
-            "name it with --set depth_unit=U, the world units for a unit of the maps",
+            "name it with `depth_unit=U`, the world units for a unit of the maps",
         )
     fits = dict.fromkeys(matches, PhotoFit(unit))
     return DepthFit(kind, unit, 0, 0.0, certain, fits, ())
@@ -219,7 +219,7 @@ def _neither(matches: Mapping[str, Matches], spread: float) -> tuple[str, str]:
         spread = _inverse(matches, "").spread
     except DatasetError:
         return text, "check that the maps belong to these photos and poses"
-    return f"{text}, while inverse depth fits to {100 * spread:.1f} %", "add --set depth_kind=inverse"
+    return f"{text}, while inverse depth fits to {100 * spread:.1f} %", "take `depth_kind=inverse`"
 
 
 def _inverse(matches: Mapping[str, Matches], where: str) -> DepthFit:

@@ -215,7 +215,7 @@ def judged_depths(
     cut = (frame.name for frame in chosen if isinstance(frame.lens, FaceLens) and frame.name not in kept)
     if face := next(cut, None):
         raise DatasetError(
-            f"{reader.path}: {face} is one of a panorama's faces, which have no depth maps; train with --lens native,"
+            f"{reader.path}: {face} is one of a panorama's faces, which have no depth maps; train with `lens=native`,"
             " which keeps panoramas whole"
         )
     files = _files(reader.path, chosen, source.path)
@@ -237,7 +237,7 @@ def _files(capture: Path, frames: Sequence[Frame], folder: Path) -> dict[str, De
     if not named and not is_folder(capture / GEOMETRIC_MAPS):
         raise DatasetError(
             f"{capture}: holds no depth map: transforms.json names none as depth_file_path, and there is no folder"
-            f" {GEOMETRIC_MAPS}; give --depth the folder of maps"
+            f" {GEOMETRIC_MAPS}; give `depth` the folder of maps"
         )
     if not named:
         return depth_files(capture / GEOMETRIC_MAPS, [frame.name for frame in frames])
@@ -270,7 +270,7 @@ def _of_points(path: Path, cameras: Sequence[tuple[str, Camera]], seen: Mapping[
     used = {name: each for name, each in seen.items() if len(each)}
     if not used:
         raise DatasetError(
-            f"{path}: has no tracks of points that photos see; --depth points needs a COLMAP model with points3D and"
+            f"{path}: has no tracks of points that photos see; `depth=points` needs a COLMAP model with points3D and"
             " the observations in images"
         )
     return _depths(POINTS, cameras, used)
@@ -279,9 +279,7 @@ def _of_points(path: Path, cameras: Sequence[tuple[str, Camera]], seen: Mapping[
 def _of_scan(reader: CaptureReader, cameras: Sequence[tuple[str, Camera]], points: Path | None) -> Depths:
     cloud = None if points is None else reader.placed(points).cloud
     if cloud is None:
-        raise DatasetError(
-            "--depth scan: takes the depth from the scan that --points names; give --points FILE"
-        )
+        raise DatasetError("depth: comes from the scan that `points` names; give `points=FILE`")
     seen = {
         name: sparse_depth(
             camera,

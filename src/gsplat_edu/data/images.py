@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.locks import ThreadLock
 from gsplat_edu.data.lens import Lens, bands, undistortion
 from gsplat_edu.data.native_lens import native_intrinsics, pixels_with_rays
 from gsplat_edu.data.panorama import FaceLens, cut_face
@@ -95,7 +96,7 @@ def _through_own_lens(source: PhotoFile, photo: Photo) -> Photo:
 class ImageStore:
     """The photos of a dataset: a cache within a memory budget; other photos are decoded again on each use.
 
-    The pixels are the same either way. Thread-safe.
+    The pixels are the same either way. Thread-safe. A pickled copy, as in a worker, begins with an empty cache.
 
     Args:
         budget: Bytes of decoded photos to keep.
@@ -122,7 +123,10 @@ class ImageStore:
         self.watch = FileWatch() if watch is None else watch
         self._kept: dict[PhotoFile, Photo] = {}
         self._nbytes = 0
-        self._lock = threading.Lock()
+        self._lock = ThreadLock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": {}, "_nbytes": 0}
 
     @property
     def nbytes(self) -> int:

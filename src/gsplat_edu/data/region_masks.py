@@ -33,7 +33,7 @@ def views_of_region(views: Sequence[View], region: Region) -> tuple[View, ...]:
     """
     if not any(counted(region, _small(view.camera)).any() for view in views):
         raise DatasetError(
-            "region.json: no photo shows the box; draw it anew with gsplat-edu view, or add --set region=none"
+            "region.json: no photo shows the box; draw it anew with gsplat-edu view, or take `region=none`"
         )
     read = [_PhotoOfRegion(view, region).read for view in views]
     return tuple(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import stat
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.base.locks import ThreadLock
 
 Stamp = tuple[int, int]
 """Size in bytes and modification time in ns; a file is hashed again only if one of them differs."""
@@ -39,7 +39,7 @@ class FileWatch:
 
     def __init__(self) -> None:
         self._known: dict[Path, tuple[Stamp, FileDigest]] = {}
-        self._lock = threading.Lock()
+        self._lock = ThreadLock()
 
     @contextmanager
     def unchanged(self, *paths: Path | None) -> Iterator[None]:

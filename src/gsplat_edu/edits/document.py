@@ -54,7 +54,7 @@ class Edits:
         if not anyway:
             raise ArgumentError(
                 f"{name}: was made for another scene ({difference}); open the scene that it names, or add"
-                " --edits-anyway"
+                " `edits_anyway`"
             )
         for index, operation in enumerate(self.operations):
             if isinstance(operation, ops.Select) and isinstance(operation.region, ops.BY_VALUE):

@@ -19,13 +19,13 @@ GAUSSIANS, REST = "gaussians", "rest"
 """Names of counts: Gaussians, and all of their higher harmonics."""
 
 REMEDIES = {
-    GAUSSIANS: "train with a lower --max-gaussians, reduce the scene",
-    REST: "train with a lower --max-gaussians or --sh-degree, reduce the scene",
-    "pairs": "make the image smaller (--resolution, --size), lower --max-gaussians",
+    GAUSSIANS: "train with a lower `max_gaussians`, reduce the scene",
+    REST: "train with a lower `max_gaussians` or `sh_degree`, reduce the scene",
+    "pairs": "make the image smaller (`resolution`, `size`), lower `max_gaussians`",
 }
 """What helps, by the count that is too large."""
 
-SMALLER_IMAGE = "make the image smaller (--resolution, --size)"
+SMALLER_IMAGE = "make the image smaller (`resolution`, `size`)"
 """Helps against any other."""
 
 
@@ -47,7 +47,7 @@ def why_too_large(program: Program, counts: Mapping[str, int], most: int, device
     each = GAUSSIANS if name == REST else name
     fit, remedy = most_that_fit(program, counts, most, each), REMEDIES.get(name, SMALLER_IMAGE)
     if name == REST and (degree := _degree_that_fits(program, counts, most)) is not None:
-        remedy = f"all fit with --sh-degree {degree} (train, convert); {remedy}"
+        remedy = f"all fit with `sh_degree={degree}`; {remedy}"
     return f"{needs}, but {device} allows {most / 2**20:.0f}: {fit} {each} fit; {remedy}"
 
 

@@ -31,6 +31,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.pictures import as_array, levels, to_bytes as to_bytes
 from gsplat_edu.base.validation import ArrayLike, check_shape, float64_array
 from gsplat_edu.evaluate.verdict import MEASURES as MEASURES
 from gsplat_edu.ops.exposure import color_matrix, falloff, measured_gains, measured_vignetting
@@ -223,24 +224,6 @@ def ssim(image: ArrayLike, truth: ArrayLike, mask: ArrayLike | None = None) -> f
     Source: Wang et al. 2004.
     """
     return _Pair(image, truth, mask).ssim()
-
-
-def to_bytes(image: ArrayLike) -> UInt8[np.ndarray, "H W 3"]:
-    """Round an image to bytes: floor(255 x + 0.5), with x clamped to 0..1. A uint8 image is returned unchanged.
-
-    Args:
-        image: (H, W, 3) array or tensor.
-
-    Raises:
-        ShapeError: not (H, W, 3).
-        ArgumentError: a value is NaN or infinite.
-    """
-    given = _as_array(image)
-    if given.dtype == np.uint8:
-        check_shape("image", given.shape, ("H", "W", 3), {})
-        return given
-    values = np.clip(float64_array("image", given, ("H", "W", 3)), 0.0, 1.0)
-    return _levels(values).astype(np.uint8)
 
 
 def score_image(
@@ -446,17 +429,6 @@ def best(scores: Sequence[ImageScore]) -> ImageScore:
     return max(scores, key=lambda score: score.psnr)
 
 
-def _levels(values: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "H W 3"]:
-    """Round values from 0 to 1 to whole levels from 0 to 255."""
-    levels = 255.0 * values
-    levels += 0.5
-    return np.asarray(np.floor(levels, out=levels))
-
-
-def _as_array(image: ArrayLike) -> np.ndarray:
-    return image.numpy(force=True) if isinstance(image, torch.Tensor) else np.asarray(image)
-
-
 def _gradient_energy(image: Float64[np.ndarray, "H W 3"]) -> Float64[np.ndarray, "2"]:
     """Return the mean squared horizontal and vertical differences at half size, over the squared mean brightness."""
     H, W = (2 * (side // 2) for side in image.shape[:2])
@@ -479,14 +451,14 @@ class _Pair:
     ) -> None:
         self.transparency = transparency
         sizes: dict[str, int] = {}
-        self.render = np.clip(float64_array("image", _as_array(image), ("H", "W", 3), sizes), 0.0, 1.0)
-        given = _as_array(truth)
+        self.render = np.clip(float64_array("image", as_array(image), ("H", "W", 3), sizes), 0.0, 1.0)
+        given = as_array(truth)
         self.photo = float64_array("truth", given, ("H", "W", 3), sizes)
         if given.dtype == np.uint8:
             self.photo = self.photo / 255.0
         self.counts: Bool[np.ndarray, "H W"] | None = None
         if mask is not None:
-            self.counts = _as_array(mask).astype(bool)
+            self.counts = as_array(mask).astype(bool)
             check_shape("mask", self.counts.shape, ("H", "W"), sizes)
             if not self.counts.any():
                 raise ArgumentError("mask: no pixel counts; leave the image out")
@@ -496,7 +468,7 @@ class _Pair:
         return _decibels(self._mean(np.square(error, out=error)))
 
     def psnr_8bit(self) -> float:
-        error = _levels(self.render)
+        error = levels(self.render)
         error /= 255.0
         error -= self.photo
         return _decibels(self._mean(np.square(error, out=error)))

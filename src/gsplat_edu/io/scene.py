@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from gsplat_edu.base.pictures import scene_shower
 from gsplat_edu.base.validation import ArrayLike
 from gsplat_edu.scene.earth import Earth
 from gsplat_edu.scene.frame import ORIGIN, UNITS, Vector, as_origin, origin_of
 from gsplat_edu.scene.gaussians import Gaussians
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """The contents of a scene file, in this package's axes (+x right, +y down, +z forward).
 
@@ -38,6 +39,26 @@ class Scene:
     unit: str | None = None
     origin: Vector = ORIGIN
     earth: Earth | None = None
+
+    def __repr__(self) -> str:
+        """Return one line: the Gaussians, and what is known of the coordinates."""
+        known = [f"{name}={value!r}" for name, value in extras(self.frame).items()]
+        return f"Scene({', '.join([repr(self.gaussians), *known])})"
+
+    def _repr_html_(self) -> str:
+        return str(scene_shower().scene_html(self))
+
+    def view(self, height: int = 480) -> object:
+        """Return the viewer's page of the scene, which a notebook shows in a frame, to turn and to walk.
+
+        Args:
+            height: Height of the frame, px.
+
+        Raises:
+            ArgumentError: the height is not a whole number of at least 100, or a parameter is NaN or infinite.
+        """
+        page: object = scene_shower().scene_page(self, height)
+        return page
 
     @property
     def frame(self) -> SceneFrame:

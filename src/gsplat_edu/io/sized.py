@@ -237,7 +237,7 @@ def best_file(ranked: Ranked, encode: Encode, judge: Judge, most: int, choices: 
     if not tried:
         smallest = ranked.part(coarsest, min(FEWEST, len(ranked)))
         raise ArgumentError(
-            f"--size: {most:,} bytes are too few: the smallest file, of {len(smallest.rows):,} splats, has"
+            f"size: {most:,} bytes are too few: the smallest file, of {len(smallest.rows):,} splats, has"
             f" {len(encode(smallest, coarsest)):,} bytes; allow at least as many"
         )
     consider(Setting(degree, precision=min(1, choices.precisions - 1)))

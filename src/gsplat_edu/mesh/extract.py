@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from gsplat_edu.base.errors import ArgumentError, NotEnoughMemoryError
@@ -24,9 +25,11 @@ from gsplat_edu.mesh.depths import (
 from gsplat_edu.mesh.plan import LONGEST_SIDE, default_voxel, fitting, touched
 from gsplat_edu.mesh.tidy import TidySettings, tidied
 from gsplat_edu.mesh.volume import TRUNCATION, SparseVolume
+from gsplat_edu.paths.orbits import orbit_of_scene
 from gsplat_edu.render.backend import Backend
+from gsplat_edu.render.backends import load_backend
 from gsplat_edu.render.settings import RenderSettings
-from gsplat_edu.scene.camera import Camera
+from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.rig import through_lenses
@@ -50,6 +53,9 @@ MOST_ENLARGEMENTS = 12
 
 BLOCK = 8
 """Voxels along an edge of a block of the volume."""
+
+ORBIT_VIEWS, ORBIT_SIDE = 8, 384
+"""Views of each of the six orbits around a scene without cameras, and their width and height, px."""
 
 FEWER = 1.02
 """Factor on a voxel that would just give the number of triangles: their number is no exact power of it."""
@@ -143,14 +149,50 @@ def extract_mesh(
     before = len(cut.raw.faces)
     if not before:
         raise ArgumentError(
-            "mesh: the views show no surface; train longer, choose a larger --voxel, or look at the depths with"
-            " render --maps"
+            "mesh: the views show no surface; train longer, choose a larger `voxel`, or look at the"
+            " rendered depths"
         )
     mesh = tidied(cut.raw, settings.tidy, progress)
     notes += _sentences(cut.counts)
     if len(mesh.faces) != before:
         notes.append(f"{before:,} faces before tidying, {len(mesh.faces):,} after it")
     return MeshResult(mesh, cut.voxel, cut.truncation, cut.memory, cut.counts, cut.views, tuple(notes))
+
+
+def mesh_of(
+    gaussians: Gaussians,
+    cameras: Sequence[CameraLike] | None = None,
+    *,
+    render_settings: RenderSettings | None = None,
+    settings: MeshSettings | None = None,
+    backend: str = "auto",
+) -> Mesh:
+    """Make a mesh of Gaussians in one call; `extract_mesh` returns depth maps and counts as well.
+
+    Args:
+        gaussians: The scene: N Gaussians, at least one.
+        cameras: The cameras whose view of it counts, such as those of a dataset; None for orbits around each axis,
+            which suit an object that is seen from outside.
+        render_settings: How the scene is rendered; None for the defaults.
+        settings: Voxels, bounds, memory and tidying; None for the defaults.
+        backend: What renders, by name.
+
+    Returns:
+        Vertices in world units, faces and colours. `gsplat_edu.io.mesh_files.write_mesh` writes it.
+
+    Raises:
+        ArgumentError: there are no Gaussians or no cameras, or the views show no surface.
+        BackendUnavailableError: the backend cannot run here.
+        NotEnoughMemoryError: as for `extract_mesh`.
+    """
+    if cameras is None:
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        cameras = [camera for up in axes for camera in orbit_of_scene(gaussians, ORBIT_VIEWS, ORBIT_SIDE, up)]
+    named = [(f"view {k}", as_camera(f"cameras[{k}]", camera)) for k, camera in enumerate(cameras)]
+    chosen = load_backend(backend, gaussians.means.device)
+    with torch.no_grad():
+        detached = gaussians.map(torch.Tensor.detach)
+        return extract_mesh(detached, named, render_settings or RenderSettings(), chosen, settings).mesh
 
 
 class CutSurface(NamedTuple):
@@ -192,7 +234,7 @@ def cut_surface(
         if fixed:
             raise NotEnoughMemoryError(
                 f"voxel: {voxel:.3g} makes {len(raw.faces):,} triangles, but the memory has room for"
-                f" {settings.most_faces:,}; take a --voxel of {FEWER * voxel * math.sqrt(excess):.2g} or more"
+                f" {settings.most_faces:,}; take a `voxel` of {FEWER * voxel * math.sqrt(excess):.2g} or more"
             )
         del volume, raw
         voxel *= FEWER * math.sqrt(excess)

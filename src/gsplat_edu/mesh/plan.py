@@ -157,7 +157,7 @@ def plan_mesh(survey: Survey, demand: Demand, free: int | None) -> MeshPlan:
     """
     base, limit, where = 0, free, "are free"
     if demand.memory is not None:
-        base, limit, where = PROGRAM_BYTES, demand.memory, "are allowed by --max-memory"
+        base, limit, where = PROGRAM_BYTES, demand.memory, "are allowed by `max_memory`"
     base += PIXEL_BYTES * survey.pixels
     painting = TEXTURE_BYTES if demand.texture else 0
     if limit is not None and limit <= base + painting:
@@ -174,7 +174,7 @@ def plan_mesh(survey: Survey, demand: Demand, free: int | None) -> MeshPlan:
         needed = spelled_bytes(base + FACE_BYTES * 3.0 * survey.area / wanted**2)
         raise NotEnoughMemoryError(
             f"voxel: {short_number(wanted, 3)} needs about {needed}, but {spelled_bytes(limit or 0)} {where};"
-            f" give more memory, or --voxel {voxel:.2g}"
+            f" give more memory, or `voxel={voxel:.2g}`"
         )
     reason = ""
     if voxel > wanted:

@@ -85,6 +85,7 @@ def depth_error(
     return value
 
 
+@first_derivative_only("depth_error", "torch's own operations")
 class _DepthError(torch.autograd.Function):
     """Compute value and gradients together, on one thread; backward only scales."""
 
@@ -129,7 +130,6 @@ class _DepthError(torch.autograd.Function):
             return (w * error).sum()
 
     @staticmethod
-    @first_derivative_only("depth_error", "torch's own operations")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         (gradients,) = ctx.saved_tensors
         if grad.device.type != "cpu" or float(grad) != 1.0:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
-from gsplat_edu.base.derivatives import chained, first_derivative_only
+from gsplat_edu.base.derivatives import chained, first_derivative_only, opaque, refuse_halves
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.threads import one_thread
 from gsplat_edu.base.validation import check_shape, in_range
@@ -25,6 +25,7 @@ LossKernel = Callable[[Tensor, Tensor, float], Tensor]
 """Computes (1 - k) L1 + k (1 - SSIM) of an image, its target and k, differentiably in the image."""
 
 
+@opaque
 def photo_loss(
     image: Float[Tensor, "H W 3"],
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
@@ -48,7 +49,9 @@ def photo_loss(
 
     Raises:
         ShapeError: the sizes differ.
+        ArgumentError: the image or the photo is float16 or bfloat16.
     """
+    _check_halves(image, target)
     if target.dtype != torch.uint8:
         target = target.to(image.dtype)
     if mask is not None:
@@ -60,6 +63,7 @@ def photo_loss(
     return (kernel or l1_ssim)(image, target, ssim_weight)
 
 
+@opaque
 @one_thread()  # the rounding of torch's sum depends on the number of threads
 def l1(
     image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"]
@@ -77,9 +81,11 @@ def l1(
         ShapeError: the sizes differ.
     """
     check_shape("target", target.shape, image.shape, {})
+    _check_halves(image, target)
     return torch.mean(torch.abs(image - _as_floats(target, image)))
 
 
+@opaque
 def l1_ssim(
     image: Float[Tensor, "H W 3"],
     target: Float[Tensor, "H W 3"] | UInt8[Tensor, "H W 3"],
@@ -106,6 +112,7 @@ def l1_ssim(
     """
     check_shape("image", image.shape, ("H", "W", 3), {})
     check_shape("target", target.shape, image.shape, {})
+    _check_halves(image, target)
     if image.dtype not in SUFFIXES or image.device.type != "cpu":
         raise ArgumentError(
             f"image: is {image.dtype} on {image.device}, but has to be float32 or float64 on the CPU"
@@ -119,6 +126,7 @@ def l1_ssim(
     return loss
 
 
+@opaque
 @one_thread()
 def l1_ssim_in_torch(
     image: Float[Tensor, "H W 3"],
@@ -153,6 +161,11 @@ def l1_ssim_in_torch(
     return (1.0 - weight) * mean + weight * (1.0 - ssim)
 
 
+def _check_halves(image: Tensor, target: Tensor) -> None:
+    for name, tensor in (("image", image), ("target", target)):
+        refuse_halves(name, tensor)
+
+
 def _as_floats(target: Tensor, image: Tensor) -> Tensor:
     """Return a target as numbers of the image's dtype, 0 to 1, without a gradient."""
     return (target.to(image.dtype) / 255.0 if target.dtype == torch.uint8 else target).detach()
@@ -168,6 +181,7 @@ def _blurred(image: Tensor) -> Tensor:
     return blurred[0].permute(1, 2, 0)
 
 
+@first_derivative_only("masked", "image * mask")
 class _Masked(torch.autograd.Function):
     """Multiply an image by a mask of 0 and 1, in reused buffers."""
 
@@ -177,12 +191,12 @@ class _Masked(torch.autograd.Function):
         return torch.mul(image, counts, out=reusable_tensor(image.shape, image))
 
     @staticmethod
-    @first_derivative_only("masked", "image * mask")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
         (counts,) = ctx.saved_tensors
         return torch.mul(grad, counts, out=reusable_tensor(grad.shape, grad)), None
 
 
+@first_derivative_only("l1_ssim", 'l1_ssim_in_torch, the loss of backend="torch"')
 class _L1Ssim(torch.autograd.Function):
     """Compute loss and gradient in one pass; backward only scales."""
 
@@ -201,7 +215,6 @@ class _L1Ssim(torch.autograd.Function):
         return x.new_tensor((1.0 - ssim_weight) * l1_mean + ssim_weight * (1.0 - ssim_mean))
 
     @staticmethod
-    @first_derivative_only("l1_ssim", "l1_ssim_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return chained(gradient, grad), None, None

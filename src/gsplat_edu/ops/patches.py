@@ -362,6 +362,7 @@ def _seen_through_lenses(
 _TORCH = Operations(torch.sqrt, torch.atan2, torch.where, torch.maximum)
 
 
+@first_derivative_only("patch_error", "patch_error_in_torch")
 class _PatchError(torch.autograd.Function):
     """Compute value and gradients in one native call; backward only scales."""
 
@@ -399,7 +400,6 @@ class _PatchError(torch.autograd.Function):
         return normals.new_tensor(value)
 
     @staticmethod
-    @first_derivative_only("patch_error", "patch_error_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         return (*(chained(gradient, grad) for gradient in ctx.saved_tensors), None, None, None, None)
 

@@ -141,6 +141,7 @@ class _Constants(NamedTuple):
     background: Color
 
 
+@first_derivative_only("recolored", "recolored_in_torch")
 class _Recolored(torch.autograd.Function):
     """The native kernel and its gradient."""
 
@@ -163,7 +164,6 @@ class _Recolored(torch.autograd.Function):
         return out
 
     @staticmethod
-    @first_derivative_only("recolored", "recolored_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         given = ctx.saved_tensors
         image, matrix, through = given[:3]

@@ -168,6 +168,7 @@ def normal_error_in_torch(
     return weight * (a * (a - agreement)).sum() / (camera.H * camera.W)
 
 
+@first_derivative_only("normal_error", "normal_error_in_torch")
 class _NormalError(torch.autograd.Function):
     """Compute value and gradients in one native call; backward only scales."""
 
@@ -195,7 +196,6 @@ class _NormalError(torch.autograd.Function):
         return normals.new_tensor(value)
 
     @staticmethod
-    @first_derivative_only("normal_error", "normal_error_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         return (*(chained(gradient, grad) for gradient in ctx.saved_tensors), None, None)
 

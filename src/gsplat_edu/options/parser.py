@@ -49,6 +49,10 @@ class OneLineParser(argparse.ArgumentParser):
         self.explain_unknown: Callable[[str, Sequence[str]], str | None] = lambda *_: None
         """Given an unknown option and the known ones, says what to write instead, or returns None."""
 
+    def options_by_name(self) -> dict[str, str]:
+        """Return the options by their destinations: "max_gaussians" and its option, "--max-gaussians"."""
+        return {action.dest: action.option_strings[-1] for action in self._actions if action.option_strings}
+
     def show_in_help(self, names: Iterable[str], appendix: Callable[[], str] = str) -> None:
         """Make --help show only these options, and add --help-all, which shows every option.
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import struct
-import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from PIL import Image
 
 from gsplat_edu.base.errors import BackendWarning, DatasetError
 from gsplat_edu.base.headroom import require_memory
+from gsplat_edu.base.locks import ThreadLock
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import install_command
 
@@ -80,7 +80,7 @@ class _PillowsLimit:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = ThreadLock()
         self._readers = 0
         self._limit: int | None = None
 

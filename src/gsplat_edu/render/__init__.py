@@ -5,6 +5,7 @@ The package can be called: `gsplat_edu.render(gaussians, camera)` is `gsplat_edu
 
 from __future__ import annotations
 
+import inspect
 import sys
 from types import ModuleType
 from typing import Any
@@ -19,5 +20,20 @@ class _CallableModule(ModuleType):
 
         return render(*arguments, **options)
 
+    @property
+    def __signature__(self) -> inspect.Signature:
+        from gsplat_edu.render.api import render
 
+        return inspect.signature(render)
+
+
+def _documentation(package: _CallableModule) -> str:
+    """Return the package's docstring, then the function's, for `help` and for notebooks."""
+    from gsplat_edu.render.api import render
+
+    return f"{_ABOUT}\n\nrender{inspect.signature(render)}\n\n{inspect.getdoc(render)}"
+
+
+_ABOUT = __doc__
+setattr(_CallableModule, "__doc__", property(_documentation))  # noqa: B010 - mypy knows __doc__ as text
 sys.modules[__name__].__class__ = _CallableModule

@@ -9,6 +9,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.derivatives import opaque, refuse_vmap
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.validation import ArrayLike, Shape, check_shape, float64_array, of_type
@@ -53,6 +54,7 @@ def render(
 ) -> RenderStack: ...
 
 
+@opaque
 def render(
     gaussians: Gaussians,
     camera: CameraLike | CameraTensors | Sequence[CameraLike | CameraTensors],
@@ -92,7 +94,8 @@ def render(
 
     Differentiable in: every raw parameter of the Gaussians, the background, the features, and a camera of tensors.
     """
-    of_type("gaussians", gaussians, Gaussians)
+    _check_gaussians(gaussians)
+    refuse_vmap("render in a loop, or give render several cameras")
     settings = RenderSettings() if settings is None else settings
     of_type("settings", settings, RenderSettings)
     chosen = backend if isinstance(backend, Backend) else load_backend(backend, gaussians.means.device)
@@ -109,6 +112,13 @@ def render(
             "camera: is an empty sequence or has different image sizes; render the cameras one by one"
         )
     return _stack(tuple(_render_one(chosen, gaussians, c, settings, extra) for c in cameras))
+
+
+def _check_gaussians(given: object) -> None:
+    """Check that Gaussians are given, and not what holds them: a scene, or a trainer."""
+    if isinstance(getattr(given, "gaussians", None), Gaussians):
+        raise ArgumentError(f"gaussians: is a {type(given).__name__}; give its Gaussians, .gaussians")
+    of_type("gaussians", given, Gaussians)
 
 
 def _extra(
@@ -195,7 +205,7 @@ def _render_one(
         require_memory(
             f"an image of {camera.W}x{camera.H} px",
             (BYTES_PER_PIXEL + BYTES_PER_CHANNEL * channels) * int(camera.W) * int(camera.H),
-            "close other programs, or render fewer pixels (--size)",
+            "close other programs, or render at a smaller `size`",
         )
     if not camera.pinhole:
         backend.require("lens", "camera: its projection or rolling shutter")

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.pictures import png, show, write_png
 from gsplat_edu.ops.moments import AdamInBackward
 from gsplat_edu.scene.gaussians import check_tensor
 
@@ -64,7 +66,7 @@ def check_features(features: Tensor, means: Tensor) -> int:
     return sizes["C"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RenderOutput:
     """One rendered view.
 
@@ -97,6 +99,35 @@ class RenderOutput:
     features: Float[Tensor, "H W C"] | None = None
     median_depth: Float[Tensor, "H W"] | None = None
     collector: Callable[[Tensor | None], Callable[[], Tensor]] | None = None
+
+    def __repr__(self) -> str:
+        """Return one line: size, number of visible Gaussians, dtype and device."""
+        H, W = self.transmittance.shape
+        dtype = str(self.image.dtype).removeprefix("torch.")
+        return f"RenderOutput({W}x{H} px, {len(self.visible):,} Gaussians, {dtype} on {self.image.device})"
+
+    def _repr_png_(self) -> bytes:
+        return png(self.image)
+
+    def show(self) -> None:
+        """Show the image in the notebook, or in the browser; without a screen, say what to do.
+
+        Raises:
+            ArgumentError: a pixel is NaN or infinite.
+        """
+        show(self, self.image, 'output.save("render.png") writes the picture')
+
+    def save(self, path: str | Path) -> None:
+        """Write the image as an 8-bit PNG: clamped to 0..1, rounded, under a temporary name that is then replaced.
+
+        Args:
+            path: Output file, which ends in .png; parent folders are created.
+
+        Raises:
+            ArgumentError: the file has another ending, or a pixel is NaN or infinite.
+            OSError: the file cannot be written. An existing file stays unchanged.
+        """
+        write_png(path, self.image)
 
     @property
     def alpha(self) -> Float[Tensor, "H W"]:

@@ -168,6 +168,7 @@ def _camera_depths(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor,
     return ((means - eye) * forward).sum(dim=-1)
 
 
+@first_derivative_only("facing_normals", "facing_normals_in_torch")
 class _Normals(torch.autograd.Function):
     """The normals of all Gaussians, natively; the same bits for any number of threads."""
 
@@ -181,7 +182,6 @@ class _Normals(torch.autograd.Function):
         return out
 
     @staticmethod
-    @first_derivative_only("facing_normals", "facing_normals_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         given = ctx.saved_tensors
         gradient = reusable_tensor(given[1].shape, given[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import matplotlib as mpl
@@ -38,7 +39,7 @@ from gsplat_edu.runs.source import NamedCamera
 from gsplat_edu.scene.camera import Camera
 from gsplat_edu.scene.mesh import Mesh
 from gsplat_edu.scene.rig import scene_extent
-from gsplat_edu.scene.views import View
+from gsplat_edu.scene.views import View, read_scaled
 
 KINDS = {"mesh": "Mesh", "collider": "Collider"}
 """The kinds of meshes that a run has a record of, the latest of each, and their titles in the report."""
@@ -145,7 +146,7 @@ def _small(view: View, camera: Camera) -> View:
     longest = max(view.camera.W, view.camera.H)
     if longest > PHOTO_SIDE or (camera.W, camera.H) != (view.camera.W, view.camera.H):
         camera = resized(camera, min(longest, PHOTO_SIDE))
-    return View.stored(camera, lambda: view.read().scaled(camera.W, camera.H), view.name)
+    return View.stored(camera, partial(read_scaled, view, camera.W, camera.H), view.name)
 
 
 def write_mesh_record(

@@ -21,7 +21,7 @@ from gsplat_edu.base.validation import ArrayLike, float64_array, in_range, whole
 from gsplat_edu.scene.intrinsics import Intrinsics
 from gsplat_edu.scene.projection import PINHOLE, Projection, jacobian_bound
 from gsplat_edu.scene.projection_formulas import NUMPY
-from gsplat_edu.scene.shutter import RollingShutter
+from gsplat_edu.scene.shutter import AT_ONCE, RollingShutter
 from gsplat_edu.scene.sight import Optics, Sight, sight
 
 WORLD_UP = (0.0, -1.0, 0.0)
@@ -68,7 +68,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = WORLD_UP) -> Floa
     return np.stack([right, np.cross(forward, right), forward])
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class Camera:
     """A camera in OpenCV axes: a pinhole, unless it has another projection.
 
@@ -126,6 +126,14 @@ class Camera:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        """Return one line: size, lens and shutter, focal lengths, principal point and centre."""
+        lens = "pinhole" if self.pinhole else self.projection.kind
+        read = "" if self.shutter is None else f" read {self.readout}"
+        eye = ", ".join(f"{x:.4g}" for x in self.eye)
+        numbers = f"fx={self.fx:.4g}, fy={self.fy:.4g}, cx={self.cx:.4g}, cy={self.cy:.4g}"
+        return f"Camera({self.W}x{self.H} px, {lens}{read}, {numbers}, eye=({eye}))"
 
     def through(self, projection: Projection = PINHOLE, shutter: RollingShutter | None = None) -> Camera:
         """Return this camera with another lens and shutter.
@@ -293,6 +301,35 @@ class Camera:
     def scaled(self, W: int, H: int) -> Camera:
         """Return the camera of the same photo at another size, see `Intrinsics.scaled`."""
         return Camera.posed(self.R, self.eye, self.intrinsics.scaled(W, H), self.shutter)
+
+    def cropped(self, top: int, left: int, H: int, W: int) -> Camera:
+        """Return the camera of a part of the photo: its principal point moves by (-left, -top).
+
+        Args:
+            top: First row of the part.
+            left: First column of the part.
+            H: Height of the part, px.
+            W: Width of the part, px.
+
+        Raises:
+            ArgumentError: the part is not within the image, the image is a panorama, or its rows are not read at once.
+        """
+        top, left = whole_number("top", top, 0), whole_number("left", left, 0)
+        H, W = whole_number("H", H, 1), whole_number("W", W, 1)
+        if top + H > self.H or left + W > self.W:
+            raise ArgumentError(
+                f"crop: {W}x{H} px at row {top}, column {left} is not within the image of {self.W}x{self.H} px"
+            )
+        if (H, W) != (self.H, self.W) and (
+            self.projection.kind == "equirectangular"
+            or (self.shutter is not None and self.shutter.readout != AT_ONCE)
+        ):
+            raise ArgumentError(
+                "crop: a panorama, or a photo with a rolling shutter, has no part with a camera of its own"
+            )
+        return Camera(self.R, self.eye, self.fx, self.fy, self.cx - left, self.cy - top, H, W).through(
+            self.projection, self.shutter
+        )
 
     def sight(self, points: ArrayLike, z_near: float = 0.0, jacobian_limit: float | None = None) -> Sight:
         """See points of the world: image position, depth, Jacobian and direction, by projection and shutter.

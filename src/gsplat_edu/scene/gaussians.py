@@ -13,7 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsplat_edu.base.derivatives import refuse_halves
 from gsplat_edu.base.errors import ArgumentError, ShapeError
+from gsplat_edu.base.pictures import scene_shower
 from gsplat_edu.base.validation import Shape, check_shape, first_index, quoted
 
 
@@ -31,7 +33,7 @@ class Gaussians:
 
     Raises:
         ShapeError: a shape differs, or the parameters have different N.
-        ArgumentError: a parameter is not a float tensor of the same dtype and device as the means.
+        ArgumentError: a parameter is not a float32 or float64 tensor of the same dtype and device as the means.
     """
 
     means: Float[Tensor, "N 3"]
@@ -47,6 +49,7 @@ class Gaussians:
         for name, tensor in given.items():
             if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
                 raise ArgumentError(f"{name}: has to be a float tensor, got {type(tensor).__name__}")
+            refuse_halves(name, tensor)
             if (tensor.dtype, tensor.device) != (self.means.dtype, self.means.device):
                 wanted = f"{self.means.dtype} on {self.means.device}"
                 raise ArgumentError(f"{name}: is {tensor.dtype} on {tensor.device}, but means are {wanted}")
@@ -73,6 +76,21 @@ class Gaussians:
         """Return one line: the number, the degree of the harmonics, dtype and device."""
         dtype = str(self.means.dtype).removeprefix("torch.")
         return f"Gaussians({len(self):,}, SH degree {self.sh_degree}, {dtype} on {self.means.device})"
+
+    def _repr_html_(self) -> str:
+        return str(scene_shower().scene_html(self))
+
+    def view(self, height: int = 480) -> object:
+        """Return the viewer's page of these Gaussians, which a notebook shows in a frame, to turn and to walk.
+
+        Args:
+            height: Height of the frame, px.
+
+        Raises:
+            ArgumentError: the height is not a whole number of at least 100, or a parameter is NaN or infinite.
+        """
+        page: object = scene_shower().scene_page(self, height)
+        return page
 
     def __getitem__(self, index: Any) -> Gaussians:  # noqa: ANN401
         """Return some of the Gaussians.

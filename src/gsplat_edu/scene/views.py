@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -14,7 +15,7 @@ from gsplat_edu.scene.given_depth import GivenDepth
 from gsplat_edu.scene.photo import Photo, Pixels
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, repr=False)
 class View:
     """A camera and its photo, in memory or still on disk.
 
@@ -52,7 +53,12 @@ class View:
     ) -> None:
         photo = Photo(image, alpha, mask)
         check_shape("image", photo.image.shape, (camera.H, camera.W, 3), {})
-        self._set(camera, name, lambda: photo, on_disk=False)
+        self._set(camera, name, partial(_kept, photo), on_disk=False)
+
+    def __repr__(self) -> str:
+        """Return one line: name, size, and where the photo is."""
+        where = "on disk" if self.on_disk else "in memory"
+        return f"View({self.name!r}, {self.camera.W}x{self.camera.H} px, {where})"
 
     @classmethod
     def stored(cls, camera: Camera, read: Callable[[], Photo], name: str = "") -> View:
@@ -60,7 +66,7 @@ class View:
 
         Args:
             camera: The camera.
-            read: Returns the photo, of the camera's size.
+            read: Returns the photo, of the camera's size. Other processes get the view only if this can be pickled.
             name: The view's name in the capture.
         """
         view = cls.__new__(cls)
@@ -96,9 +102,8 @@ class View:
         if factor == 1.0:
             return self
         W, H = (max(1, round(side / factor)) for side in (self.camera.W, self.camera.H))
-        return View.stored(self.camera.scaled(W, H), lambda: self.read().scaled(W, H), self.name).with_depth(
-            self.depth
-        )
+        read = partial(read_scaled, self, W, H)
+        return View.stored(self.camera.scaled(W, H), read, self.name).with_depth(self.depth)
 
     def _set(
         self,
@@ -116,3 +121,18 @@ class View:
     def image(self) -> Pixels:
         """RGB of the photo, (H, W, 3)."""
         return self.read().image
+
+
+def _kept(photo: Photo) -> Photo:
+    return photo
+
+
+def read_scaled(view: View, W: int, H: int) -> Photo:
+    """Read the photo of a view, at another size.
+
+    Args:
+        view: The view.
+        W: Width, px; at most the photo's.
+        H: Height, px; at most the photo's.
+    """
+    return view.read().scaled(W, H)

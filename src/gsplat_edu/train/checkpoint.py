@@ -61,7 +61,7 @@ def save_checkpoint(folder: Path, trainer: Trainer, seconds: float) -> Path:
     except (OSError, SafetensorError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise CheckpointError(
-            f"{path}: cannot be written ({reason}); earlier checkpoints are unharmed, make room and use --resume"
+            f"{path}: cannot be written ({reason}); earlier checkpoints are unharmed, make room and resume"
         ) from None
     for old in list_checkpoints(folder)[:-KEPT]:
         old.unlink(missing_ok=True)

@@ -113,8 +113,8 @@ def from_gaussians(gaussians: Gaussians, config: TrainConfig) -> tuple[Gaussians
         raise ArgumentError("contains no Gaussian to start from; give another scene")
     if config.max_gaussians is not None and len(kept) > config.max_gaussians:
         raise ArgumentError(
-            f"contains {len(kept)} Gaussians, more than max_gaussians = {config.max_gaussians}; raise that, or reduce"
-            " the scene with `gsplat-edu convert --min-opacity`"
+            f"contains {len(kept)} Gaussians, more than max_gaussians = {config.max_gaussians}; raise that, or leave"
+            " out faint Gaussians"
         )
     wanted, stored = (config.sh_degree + 1) ** 2 - 1, kept.sh_rest.shape[1]
     if stored > wanted:

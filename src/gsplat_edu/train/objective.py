@@ -205,6 +205,7 @@ class MeanScale:
         return value
 
 
+@first_derivative_only("the mean opacity", "weight * torch.sigmoid(logits).mean()")
 class _MeanOpacity(torch.autograd.Function):
     """Compute weight mean(sigmoid(l)) of all or some, with the gradient weight o (1 - o) / N, in reused buffers.
 
@@ -226,12 +227,12 @@ class _MeanOpacity(torch.autograd.Function):
             return value
 
     @staticmethod
-    @first_derivative_only("the mean opacity", "weight * torch.sigmoid(logits).mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return chained(gradient, grad), None, None
 
 
+@first_derivative_only("the mean scale", "weight * log_scales.exp().mean()")
 class _MeanScale(torch.autograd.Function):
     """Compute weight mean(exp(l)), with the gradient weight exp(l) / N; on one thread, as above."""
 
@@ -246,7 +247,6 @@ class _MeanScale(torch.autograd.Function):
             return gradient.sum()
 
     @staticmethod
-    @first_derivative_only("the mean scale", "weight * log_scales.exp().mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return chained(gradient, grad), None, None

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsplat_edu.base.buffers import reused_buffers
 from gsplat_edu.base.errors import ArgumentError, DatasetError
+from gsplat_edu.base.pictures import curve_html
 from gsplat_edu.base.validation import of_type, offers
 from gsplat_edu.render.backend import Backend, check_backend_value
 from gsplat_edu.render.settings import RenderSettings
@@ -103,6 +104,7 @@ class Trainer:
             )
         self.config, self.extent, self.density = config, extent, parts.density
         self.iteration = 0
+        self._losses: list[float] = []
         self._callbacks = tuple(callbacks)
         drawn = config.random_background or config.alpha_background == "random"
         behind, device = None if drawn else config.background, gaussians.means.device
@@ -112,6 +114,15 @@ class Trainer:
         room = self.stepper.photo_room
         self._feed = ViewFeed(views, config.view_order, config.seed, behind, device, room, outside)
         self._backgrounds = np.random.default_rng((config.seed, BACKGROUND_STREAM))
+
+    def __repr__(self) -> str:
+        """Return one line: how far it is, the number of Gaussians, and the last loss."""
+        loss = f", loss {self._losses[-1]:.4g}" if self._losses else ""
+        count = f"{len(self.gaussians):,} Gaussians"
+        return f"Trainer(iteration {self.iteration} of {self.config.iterations}, {count}{loss})"
+
+    def _repr_html_(self) -> str:
+        return curve_html(self._losses, repr(self))
 
     @property
     def gaussians(self) -> Gaussians:
@@ -161,16 +172,19 @@ class Trainer:
         receivers = (*self._callbacks, *callbacks)
         losses, counts = Losses(self.gaussians.means.detach()), []
         start = time.perf_counter()
-        with reused_buffers():
-            while self.iteration < self.config.iterations:
-                step = self._step()
-                losses.add(step.terms)
-                counts.append(step.num_gaussians)
-                self._tell(step, receivers)
-                for event in self._change(step.iteration):
-                    self._tell(event, receivers)
-                if stop():
-                    break
+        try:
+            with reused_buffers():
+                while self.iteration < self.config.iterations:
+                    step = self._step()
+                    losses.add(step.terms)
+                    counts.append(step.num_gaussians)
+                    self._tell(step, receivers)
+                    for event in self._change(step.iteration):
+                        self._tell(event, receivers)
+                    if stop():
+                        break
+        finally:  # a notebook's user may interrupt it and look at the curve
+            self._losses += losses.read()
         return TrainResult(losses.read(), counts, time.perf_counter() - start)
 
     def _step(self) -> StepEvent:

@@ -39,6 +39,7 @@ class EmptyOutside:
         return value
 
 
+@first_derivative_only("the alpha outside masks", "weight * (1 - transmittance)[outside].sum()")
 class _EmptyOutside(torch.autograd.Function):
     """Compute weight sum_outside(1 - T) / (H W), with the gradient -weight / (H W) outside.
 
@@ -54,7 +55,6 @@ class _EmptyOutside(torch.autograd.Function):
             return (transmittance * gradient).sum() - gradient.sum()
 
     @staticmethod
-    @first_derivative_only("the alpha outside masks", "weight * (1 - transmittance)[outside].sum()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return chained(gradient, grad), None, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -75,15 +76,14 @@ def _converted(view: View, found: Float[Tensor, " numbers"]) -> View:
 
     y becomes y / g + 0.055 (1 / g - 1), with g the product of both.
     """
+    return View.stored(view.camera, partial(_read_converted, view, found), view.name)
 
-    def read() -> Photo:
-        photo = view.read()
-        pixels = photo.image
-        values = torch.from_numpy(np.ascontiguousarray(pixels)).float() / (
-            255.0 if pixels.dtype == np.uint8 else 1.0
-        )
-        plane = falloff(-found[3], *values.shape[:2]) if len(found) > 3 else None
-        image = recolored(values, color_matrix(-found[:3]), falloff=plane).clamp(0.0, 1.0)
-        return Photo(image.numpy(), photo.alpha, photo.mask)
 
-    return View.stored(view.camera, read, view.name)
+def _read_converted(view: View, found: Float[Tensor, " numbers"]) -> Photo:
+    photo = view.read()
+    pixels = photo.image
+    scale = 255.0 if pixels.dtype == np.uint8 else 1.0
+    values = torch.from_numpy(np.ascontiguousarray(pixels)).float() / scale
+    plane = falloff(-found[3], *values.shape[:2]) if len(found) > 3 else None
+    image = recolored(values, color_matrix(-found[:3]), falloff=plane).clamp(0.0, 1.0)
+    return Photo(image.numpy(), photo.alpha, photo.mask)

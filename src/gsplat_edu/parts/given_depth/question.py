@@ -26,7 +26,7 @@ def check_depth(path: Path) -> None:
     """
     if str(path) not in WORDS and not path.is_dir():
         raise ArgumentError(
-            f"--depth: {path} is no folder; give the folder of maps, or one of the words {', '.join(WORDS)}"
+            f"depth: {path} is no folder; give the folder of maps, or one of the words {', '.join(WORDS)}"
         )
 
 

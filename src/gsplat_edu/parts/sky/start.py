@@ -53,7 +53,7 @@ def start_sky(dataset: Dataset, config: TrainConfig) -> tuple[Gaussians, Shell]:
     most = MOST if cap is None else min(MOST, int(MOST_OF_CAP * cap))
     if most < 1:
         raise ArgumentError(
-            f"--sky: --max-gaussians {cap} leaves no room for a sky; raise it, or use --sky none"
+            f"sky: `max_gaussians={cap}` leaves no room for a sky; raise it, or use `sky=none`"
         )
     small = [view.scaled(max(1.0, max(view.camera.W, view.camera.H) / SIDE)) for view in dataset.train]
     cameras, images, masks = [view.camera for view in small], [], []
@@ -68,7 +68,7 @@ def start_sky(dataset: Dataset, config: TrainConfig) -> tuple[Gaussians, Shell]:
     sky = find_sky(cameras, images, points, masks)
     if sky.share < LEAST_SKY:
         raise ArgumentError(
-            "--sky: no photo shows a smooth region above the horizon that reaches its edge; use --sky none"
+            "sky: no photo shows a smooth region above the horizon that reaches its edge; use `sky=none`"
         )
     shell = shell_around(dataset)
     return sky_splats(sky, shell, config.sh_degree, most), shell

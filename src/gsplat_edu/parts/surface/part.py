@@ -52,7 +52,7 @@ class SurfacePart(Part):
         if flat := next((v for v in setup.views if v.camera.projection.kind == "orthographic"), None):
             raise ArgumentError(
                 f"surface: needs rays that meet in the camera, and {flat.name or 'a photo'} is orthographic; "
-                "leave it out, or train without --surface"
+                "leave it out, or train without `surface`"
             )
         turns = Turns(settings.surface_start, settings.surface_every, settings.batch)
         terms: dict[str, Any] = {

@@ -83,6 +83,7 @@ class FlatTerm:
         return value
 
 
+@first_derivative_only("the mean smallest scale", "weight * log_scales.min(dim=1).values.exp().mean()")
 class _MeanSmallest(torch.autograd.Function):
     """Compute weight mean(exp(min(l))) of some rows; on one thread, whose rounding does not depend on the others."""
 
@@ -97,7 +98,6 @@ class _MeanSmallest(torch.autograd.Function):
             return scaled.sum()
 
     @staticmethod
-    @first_derivative_only("the mean smallest scale", "weight * log_scales.min(dim=1).values.exp().mean()")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         return gradient * grad, None, None

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
-from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.derivatives import first_derivative_only, opaque
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native, native_array
 from gsplat_edu.ops.lenses import native_camera
@@ -95,6 +95,7 @@ def render_cpu(
     return _output(call, extra, pose, *(tensors[name] for name in RAW))
 
 
+@opaque
 def render_covariances(
     means: Tensor,
     cov3ds: Tensor,
@@ -268,6 +269,7 @@ def _group(parameter: Tensor, moments: Moments) -> Any:  # noqa: ANN401
     )
 
 
+@first_derivative_only("backend 'cpu'", 'backend="torch"')
 class _Rasterize(torch.autograd.Function):
     """The complete native renderer as one differentiable operation."""
 
@@ -320,7 +322,6 @@ class _Rasterize(torch.autograd.Function):
         return tuple(images)
 
     @staticmethod
-    @first_derivative_only("backend 'cpu'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, *saved = ctx.saved_tensors
         drawn, kept = saved[:5], saved[5:]

@@ -76,6 +76,7 @@ def seen_through(
     return seen
 
 
+@first_derivative_only("backend 'cuda'", 'backend="torch"')
 class _Sight(torch.autograd.Function):
     """The kernels of `sight`, forward and backward."""
 
@@ -99,7 +100,6 @@ class _Sight(torch.autograd.Function):
         return seen
 
     @staticmethod
-    @first_derivative_only("backend 'cuda'", 'backend="torch"')
     def backward(ctx: Any, grad_seen: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         means, row, seen = ctx.saved_tensors
         wanted = ctx.needs_input_grad[2 : 2 + POSE]

@@ -215,6 +215,7 @@ def l1_ssim_triton(
     return loss
 
 
+@first_derivative_only("l1_ssim", 'l1_ssim_in_torch, the loss of backend="torch"')
 class _L1Ssim(torch.autograd.Function):
     """Compute loss and gradient together; backward only scales."""
 
@@ -228,7 +229,6 @@ class _L1Ssim(torch.autograd.Function):
         return _loss_and_gradient(x, y, gradient, ssim_weight)
 
     @staticmethod
-    @first_derivative_only("l1_ssim", "l1_ssim_in_torch")
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN401
         (gradient,) = ctx.saved_tensors
         # Even if it is 1: checking would synchronise with the device.

@@ -155,6 +155,7 @@ def render_triton(
     )
 
 
+@first_derivative_only("backend 'cuda'", 'backend="torch"')
 class _Rasterize(torch.autograd.Function):
     """The complete renderer as one differentiable operation."""
 
@@ -187,7 +188,6 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, depth, mixed, median
 
     @staticmethod
-    @first_derivative_only("backend 'cuda'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, seen, mixed, image, transmittance, depth, *kept = ctx.saved_tensors
         call: _Call = ctx.call

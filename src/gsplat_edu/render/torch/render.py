@@ -17,6 +17,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.constants import ALPHA_MAX, ALPHA_MIN, DET_FLOOR, SH_OFFSET, THINNEST
+from gsplat_edu.base.derivatives import inside_torch_func
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import first_index, in_range, whole_number
 from gsplat_edu.render.camera_tensors import CameraTensors
@@ -166,7 +167,7 @@ def render_dense(
     colors = eval_sh_t(degree, gaussians.sh, _viewing_directions(gaussians.means, camera))
     R, scales = quat_to_R_t(gaussians.quats), torch.exp(gaussians.log_scales)
     screen = project_visible(gaussians.means, R * scales[:, None, :], camera, settings, factors=(R, scales))
-    if screen.means2d.requires_grad:
+    if screen.means2d.requires_grad and not inside_torch_func():  # which refuses it
         screen.means2d.retain_grad()
     opacities = _dimmed(gaussians.opacities, screen)
     channels = [colors[screen.visible]] + ([screen.depths[:, None]] if settings.depth else [])

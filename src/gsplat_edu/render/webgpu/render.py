@@ -143,6 +143,7 @@ def engine_view(
     )  # fmt: skip
 
 
+@first_derivative_only("backend 'webgpu'", 'backend="torch"')
 class _Rasterize(torch.autograd.Function):
     """The complete renderer as one differentiable operation."""
 
@@ -170,7 +171,6 @@ class _Rasterize(torch.autograd.Function):
         return image, transmittance, depth, mixed, median
 
     @staticmethod
-    @first_derivative_only("backend 'webgpu'", 'backend="torch"')
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         features, transmittance, *parameters = ctx.saved_tensors
         call: _Call = ctx.call
@@ -267,7 +267,7 @@ def replace_device(lost: Device, losses: int, what: str, error: DeviceLostError)
     if losses > MOST_LOSSES:
         raise DeviceLostError(
             f"backend 'webgpu': {name} was lost {losses} times during the same work; update its driver, lower "
-            "--max-gaussians or --resolution, or use the backend cpu; --resume continues from the last checkpoint"
+            "`max_gaussians` or the `resolution`, or use the backend cpu; resume from the last checkpoint"
         ) from error
     _pool().renew(lost)
     warnings.warn(f"backend 'webgpu': {name} was lost; {what} on a new device", BackendWarning, stacklevel=4)
