@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, TimeRemainingColumn
 
 from gsplat_edu.cli.main import main
-from gsplat_edu.cli.terminal import LINE_SECONDS, Bar, clock, stage_bars
+from gsplat_edu.cli.terminal import GROWS, LINE_SECONDS, Bar, clock, stage_bars
 from gsplat_edu.cli.train import progress_bar
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.writers import write_colmap
@@ -74,14 +74,37 @@ def test_short_tasks_and_tasks_that_print_their_own_lines_print_nothing(log):
     assert lines(log) == []
 
 
-def test_stages_of_unknown_speed_show_the_elapsed_time_only():
+def test_the_forecast_of_mapping_knows_that_photos_take_longer_and_longer():
+    time = Time()
+    log = Console(file=io.StringIO(), width=80, get_time=time)
+    growth, registered = GROWS["mapping"], 1000.0
+    whole = registered / growth.share
+    with stage_bars(log) as progress:
+        progress("mapping", 0, 100)
+        for done in (5, 30, 60, 100):
+            time.now = registered * (done / 100) ** growth.power
+            progress("mapping", done, 100)
+        time.now = (registered + whole) / 2
+        progress("mapping", 100, 100)
+        time.now = whole + 60.0
+        progress("mapping", 100, 100)
+    passed = [registered * share**growth.power for share in (0.3, 0.6, 1.0)] + [(registered + whole) / 2]
+    told = [line.partition("elapsed")[2] for line in lines(log)]
+    forecast = [f", {clock(whole - seconds)} left" for seconds in passed]
+    assert told == [*forecast, ""], "a forecast that has passed is not shown"
+
+
+def test_an_attempt_that_starts_over_has_its_own_forecast():
     time = Time()
     log = Console(file=io.StringIO(), width=80, get_time=time)
     with stage_bars(log) as progress:
-        progress("mapping", 0, 120)
-        for time.now in (40.0, 50.0, 75.0):
-            progress("mapping", 7, 120)
-    assert lines(log) == ["mapping: 7 of 120, 0:40 elapsed", "mapping: 7 of 120, 1:15 elapsed"]
+        for attempt in range(2):
+            progress("mapping", 0, 100)
+            for done in (40, 41):
+                time.now += 40.0
+                progress("mapping", done, 100)
+            assert len(lines(log)) == 2 * (attempt + 1)
+    assert lines(log)[:2] == lines(log)[2:], "the time of an earlier attempt does not count"
 
 
 def test_stages_of_steady_speed_show_the_time_left():

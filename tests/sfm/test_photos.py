@@ -5,6 +5,8 @@ import pytest
 from PIL import Image
 
 from gsplat_edu.base.errors import DatasetError
+from gsplat_edu.photos.decoding import decode
+from gsplat_edu.scene.photo import area_mean
 from gsplat_edu.sfm.photos import PhotoFacts, camera_kinds, copy_photos, fingerprint, photo_files
 from systems import needs_posix
 
@@ -42,6 +44,23 @@ def test_photos_are_recognised_by_their_contents(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "walk.mp4").write_bytes(b"\0" * 100)
     assert photo_files(tmp_path) == sorted(wanted)
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_a_copy_of_a_large_jpeg_shows_what_the_whole_photo_does(tmp_path, orientation):
+    """It is decoded at half its size."""
+    v, u = np.mgrid[:480, :640]
+    wave = 127.5 * (1 + np.sin(u / 23 + v / 31) * np.cos(u / 41 - v / 13))
+    pixels = np.stack([wave, 0.5 * wave, 0.25 * wave], axis=2).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = photo(tmp_path / "photos" / "a.jpg", exif, pixels, quality=95)
+    copy_photos([path], path.parent, tmp_path / "copies", 200)
+    (copy,) = (tmp_path / "copies").iterdir()
+    wanted = area_mean(decode(path)[0], 200, 150).astype(float)
+    found = np.asarray(Image.open(copy)).astype(float)
+    assert found.shape == wanted.shape
+    assert np.abs(found - wanted).mean() < 1.5
 
 
 def test_photos_must_be_in_one_folder(tmp_path):

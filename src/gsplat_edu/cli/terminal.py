@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.progress import (
@@ -31,11 +31,40 @@ LINE_SECONDS = 30.0
 LINE_SHARE = 0.05
 """Least fraction of a task's time between two lines, so that a long task does not fill a log."""
 
-UNSTEADY = "mapping"
-"""The stage of `sfm` without a forecast: each photo takes longer than the last, and it may start over."""
-
 SPEED_SECONDS = 300.0
 """Seconds over which a task's speed is averaged: some tasks take a minute per step."""
+
+
+class Growth(NamedTuple):
+    """Forecast of a stage whose steps take longer and longer: the time of n steps grows with n^power.
+
+    Args:
+        power: The exponent.
+        share: Fraction of the stage's time that all steps take; the rest follows the last step.
+        least: Fraction of the steps from which on the forecast is shown.
+    """
+
+    power: float
+    share: float
+    least: float
+
+    def left(self, task: Task) -> float | None:
+        """Return the time left, s; None if it is unknown.
+
+        Args:
+            task: The task; its field "reached" is the time after which its latest step was done, s.
+        """
+        done = task.completed / task.total if task.total else 0.0
+        if done < self.least:
+            return None
+        left = task.fields["reached"] / (self.share * done**self.power) - (task.elapsed or 0.0)
+        return left if left > 0 else None
+
+
+GROWS: Mapping[str, Growth] = {"mapping": Growth(power=1.2, share=0.66, least=0.2)}
+"""Stages whose steps take longer and longer. In `sfm`, each photo that gets a pose is adjusted with those before it;
+after the last one, all are adjusted again, and the lens is chosen. Of the processor time for snowmiku97 (32 s), 9 % had
+passed at 18 of 97 photos, 28 % at 42, and 68 % at all; of that for fox (35 s), 65 % at all."""
 
 
 class Terminal(Console):
@@ -87,25 +116,29 @@ class Bar(Progress):
         super().advance(task_id, advance)
         self._report(task_id)
 
+    def elapsed(self, task_id: TaskID) -> float:
+        """Return the time that a task has run, s."""
+        return self._tasks[task_id].elapsed or 0.0
+
     def due(self, task_id: TaskID) -> bool:
         """Return whether a task's last line was long ago: `LINE_SECONDS`, or `LINE_SHARE` of the task's time.
 
         Args:
             task_id: The task. A field "lines" that is false keeps this class from printing lines for it.
         """
-        elapsed = self._tasks[task_id].elapsed or 0.0
+        elapsed = self.elapsed(task_id)
         return elapsed - self._told.get(task_id, 0.0) >= max(LINE_SECONDS, LINE_SHARE * elapsed)
 
     def times(self, task_id: TaskID) -> str:
         """Return the time that a task has run, and its time left.
 
-        The time left is missing if no column of the bars forecasts it, or if the task's field "steady" is false.
+        The time left is missing if no column of the bars forecasts it.
         """
         task = self._tasks[task_id]
-        self._told[task_id] = task.elapsed or 0.0
-        said = f"{clock(task.elapsed or 0.0)} elapsed"
-        if task.fields.get("steady", True) and any(isinstance(c, TimeRemainingColumn) for c in self.columns):
-            remaining = task.time_remaining
+        self._told[task_id] = self.elapsed(task_id)
+        said = f"{clock(self.elapsed(task_id))} elapsed"
+        if any(isinstance(column, TimeRemainingColumn) for column in self.columns):
+            remaining = time_left(task)
             said += "" if remaining is None else f", {clock(remaining)} left"
         return said
 
@@ -123,15 +156,24 @@ class Bar(Progress):
 
 def _left(task: Task) -> float | None:
     """Return a task's time left; None at its end, since the time of what follows is unknown."""
-    return None if task.finished else task.time_remaining
+    return None if task.finished and "growth" not in task.fields else time_left(task)
+
+
+def time_left(task: Task) -> float | None:
+    """Return the time left of a task, s, by its speed, or by the `Growth` in its field "growth"; None if unknown."""
+    growth: Growth | None = task.fields.get("growth")
+    return task.time_remaining if growth is None else growth.left(task)
 
 
 class TimeLeft(TimeRemainingColumn):
-    """The time left; empty for tasks whose field "steady" is false, because their speed changes too much."""
+    """The time left, also of tasks with a field "growth"."""
 
     def render(self, task: Task) -> Text:
         """Return the time left, or nothing."""
-        return super().render(task) if task.fields.get("steady", True) else Text()
+        if "growth" not in task.fields:
+            return super().render(task)
+        left = time_left(task)
+        return Text("" if left is None else clock(left), style="progress.remaining")
 
 
 def clock(seconds: float) -> str:
@@ -175,13 +217,18 @@ def stage_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     )
     with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         current: tuple[str, TaskID] | None = None
+        before = 0
 
         def show(stage: str, done: int, total: int) -> None:
-            nonlocal current
-            if current is None or current[0] != stage:
+            nonlocal current, before
+            starts_over = stage in GROWS and done < before
+            if current is None or current[0] != stage or starts_over:
                 if current is not None:
                     bar.update(current[1], visible=False)
-                current = stage, bar.add_task(stage, total=total, steady=stage != UNSTEADY)
-            bar.update(current[1], completed=done, total=total)
+                fields: dict[str, Any] = {"growth": GROWS[stage], "reached": 0.0} if stage in GROWS else {}
+                current, before = (stage, bar.add_task(stage, total=total, **fields)), 0
+            changes = {"reached": bar.elapsed(current[1])} if stage in GROWS and done > before else {}
+            before = done
+            bar.update(current[1], completed=done, total=total, **changes)
 
         yield show

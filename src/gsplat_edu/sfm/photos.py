@@ -446,8 +446,8 @@ def _copy(path: Path, photo: PhotoFacts, folder: Path, longest: int, remade: tup
     target = folder / photo.copy
     if target.is_file():
         return
-    pixels, alpha = decode(path, photo.sensor)
     size = photo.copy_size(longest)
+    pixels, alpha = decode(path, photo.sensor, smaller=min(size))
     try:
         if remade is not None:
             turn_mask(*remade, Path(photo.mask))

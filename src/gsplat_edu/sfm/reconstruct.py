@@ -73,22 +73,24 @@ from gsplat_edu.sfm.photos import (
 )
 from gsplat_edu.sfm.result import build_capture, note_published, publish, published
 from gsplat_edu.sfm.scale import Sight, in_given_world, placed
+from gsplat_edu.sfm.search import Groups, find_features
 from gsplat_edu.sfm.source import FEWEST, check_source, listed, too_few
 from gsplat_edu.sfm.stages import Stages
 from gsplat_edu.sfm.video import choose_frames, is_video, write_frames
 from gsplat_edu.sfm.whole_photos import WholePhotos
 from gsplat_edu.sfm.wide_lenses import CameraGroup, camera_groups, circles_of, lens_lines, write_lens_masks
 
-FEATURES, MAPPING = 3, 4
+FEATURES, MAPPING = 4, 4
 """Versions of the methods. They are part of the stages' options, so results of an earlier version in a work folder are
 recomputed. Version 2 limits features to `max_features` and judges poses. Version 3 shares focal lengths between sizes;
-version 4 also if every photo has its own size."""
+version 4 also if every photo has its own size. Version 4 of the features searches as coarsely as finds enough."""
 
 FACES = 1
 """Version of the method that cuts panoramas."""
 
-PHOTOS = 2
-"""Version of the method that copies photos. Version 2 reads the facts of the photos from their headers."""
+PHOTOS = 3
+"""Version of the method that copies photos. Version 2 reads the facts of the photos from their headers; version 3
+decodes JPEGs at a smaller size."""
 
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -399,19 +401,29 @@ class _Run:
         return min(FEW_FEATURES, self.options.max_features // 2)
 
     def _features(self, sift: Mapping[str, float] | None = None) -> dict[str, Any]:
-        total, most = len(self.photos), self.options.max_features
+        total, most, database = len(self.photos), self.options.max_features, self.folder / "database.db"
         masks = write_lens_masks(
             self.cameras, mask_folder(self.folder / "photos"), self.folder / "lens_masks"
         )
-        found = self._call(
-            "features",
-            lambda done: self._progress("features", min(done, total), total),
-            photos=str(self.folder / "photos"),
-            masks=str(masks) if masks.is_dir() else "",
-            groups=self.groups,
-            sift={"max_num_features": most, **(sift or {})},
-        )["features"]
-        limit_features(self.folder / "database.db", most)
+
+        def find(groups: Groups, settings: Mapping[str, float], into: Path) -> dict[str, int]:
+            count = sum(len(group["names"]) for group in groups)
+            stage = "features" if count == total else "trying features"
+            found: dict[str, int] = self._call(
+                "features",
+                lambda done: self._progress(stage, min(done, count), count),
+                database=str(into),
+                photos=str(self.folder / "photos"),
+                masks=str(masks) if masks.is_dir() else "",
+                groups=groups,
+                sift={"max_num_features": most, **settings},
+            )["features"]
+            return found
+
+        found = (
+            find_features(find, self.groups, database) if sift is None else find(self.groups, sift, database)
+        )
+        limit_features(database, most)
         found = {name: min(count, most) for name, count in found.items()}
         names = [photo.name for photo in self.photos if not found.get(photo.copy)]
         if names:
@@ -584,7 +596,7 @@ class _Run:
 
     def _call(self, job: str, progress: Callable[[int], None], **arguments: object) -> dict[str, Any]:
         common = {"database": str(self.folder / "database.db"), "threads": self.threads, "seed": COLMAP_SEED}
-        return call(job, self.folder / "log.txt", progress, **common, **arguments)
+        return call(job, self.folder / "log.txt", progress, **(common | arguments))
 
 
 def _place(value: Sequence[float] | None) -> tuple[float, float, float] | None:
