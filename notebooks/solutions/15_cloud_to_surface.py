@@ -77,8 +77,8 @@ for voxels, errors in table.items():
     print(f"truncation {voxels}: " + ", ".join(f"{name} {value:.3f}" for name, value in errors.items()))
 assert all(set(errors) == set(names) for errors in table.values()), f"name each of {', '.join(names)}"
 assert all(0 < value < 8 for errors in table.values() for value in errors.values()), "errors are in voxels"
-assert all(table[8][name] > table[3][name] for name in names), (
-    "a truncation of 8 voxels is worse for each object"
+assert sum(table[8][name] > 1.2 * table[3][name] for name in names) >= 4, (
+    "a truncation of 8 voxels is worse by a fifth for at least four of the five objects"
 )
 
 
