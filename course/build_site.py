@@ -1,6 +1,6 @@
 """Build the site: chapters, documents and the reference of every module, as pages that open from disk.
 
-    python course/build_site.py [--out out/site]
+    python course/build_site.py [--out out/site] [--public]
 
 Pages keep the layout of the repository, so that their relative links stay valid; links to modules point to their
 reference pages. A warning from the generator stops the build with exit code 1. Notebooks are shown as built, with their
@@ -165,8 +165,15 @@ def relinked(text: str, page: Path, stage: Path) -> str:
     return LINK.sub(replaced, text)
 
 
-def gather(stage: Path) -> None:
-    """Write all pages to an empty folder."""
+def gather(stage: Path, public: bool) -> None:
+    """Write all pages to an empty folder.
+
+    Args:
+        stage: The folder.
+        public: Document members of modules that define a name of `PUBLIC`; the other modules have a page with their
+            name.
+    """
+    documented = _public_modules() if public else set(modules())
     records = sorted(path.relative_to(ROOT) for path in (ROOT / "docs" / "decisions").glob("*.md"))
     documents = [Path(name) for name in (*LEARN, *USE, *BUILD_ON) if (ROOT / name).exists()]
     chapters = sorted(path.relative_to(ROOT) for path in (ROOT / "notebooks").glob("*.ipynb"))
@@ -186,7 +193,7 @@ def gather(stage: Path) -> None:
         notebook["cells"].append(_origin(page, len(notebook["cells"])))
         write(stage / page, json.dumps(notebook))
     for name in modules():
-        write(stage / "reference" / f"{name}.md", _reference(name))
+        write(stage / "reference" / f"{name}.md", _reference(name, documented=name in documented))
     write(stage / "reference" / "index.md", _public_api())
     write(stage / "notebooks" / "quizzes.md", quizzes(chapters))
     write(stage / "docs" / "decisions" / "index.md", _records(records))
@@ -266,7 +273,7 @@ def _figure(page: str, number: int) -> bytes:
     return base64.b64decode("".join(figures[number]))
 
 
-def _reference(name: str) -> str:
+def _reference(name: str, *, documented: bool) -> str:
     """Return the page of a module; the page of a package also lists its modules.
 
     These pages are not part of the sidebar: two hundred entries on every page would hide the others.
@@ -277,7 +284,8 @@ def _reference(name: str) -> str:
     path = [f"[{'.'.join(above[: i + 1])}]({'.'.join(above[: i + 1])}.md)" for i in range(len(above))]
     head = " / ".join(["[Reference](index.md)", *path])
     page = f"---\norphan: true\n---\n\n{head}\n\n# {name}\n\n"
-    page += f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n{again}\n```\n"
+    members = f".. automodule:: {name}\n   :members:\n{again}" if documented else f".. py:module:: {name}"
+    page += f"```{{eval-rst}}\n{members}\n```\n"
     inside = [other for other in modules() if other.rpartition(".")[0] == name and name != "gsplat_edu"]
     return page + ("\n## Modules\n\n" + _listed(inside) if inside else "")
 
@@ -306,6 +314,14 @@ def _public_api() -> str:
     parts += ["## Packages\n", _listed(packages)]
     parts += ["## Modules\n", _listed(["gsplat_edu", *(n for n in top if n not in packages)])]
     return "\n".join(parts)
+
+
+def _public_modules() -> set[str]:
+    """Return the modules that define a name of `PUBLIC`."""
+    listed = [_names(names) if isinstance(names, str) else names for names in PUBLIC.values()]
+    names = [name for topic in listed for name in topic]
+    found = {getattr(_found(name), "__module__", None) or name.rpartition(".")[0] for name in names}
+    return found | {name.rpartition(".")[0] for name in names}
 
 
 def _names(module: str) -> list[str]:
@@ -366,6 +382,7 @@ def main() -> int:
     """Build the site; return 1 if the generator warned."""
     parser = argparse.ArgumentParser(description="Build the site of chapters, documents and reference.")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="folder (default: out/site)")
+    parser.add_argument("--public", action="store_true", help="document only the modules of the public API")
     given = parser.parse_args()
     out = given.out.resolve()
     if out.exists() and not (out / "objects.inv").is_file() and not (out.is_dir() and not any(out.iterdir())):
@@ -373,7 +390,7 @@ def main() -> int:
         return 2
     with tempfile.TemporaryDirectory() as scratch:
         stage, made = Path(scratch) / "source", Path(scratch) / "site"
-        gather(stage)
+        gather(stage, given.public)
         # Python's collector would look through all pages again and again.
         program = (
             "import gc, sys; gc.set_threshold(200_000); from sphinx.cmd.build import main; sys.exit(main())"
