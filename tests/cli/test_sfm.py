@@ -185,9 +185,9 @@ def _refused(tmp_path, capsys, source, out, says):
         (["--frames", "many"], "--frames"),
         (["--matcher", "best"], "matcher"),
         (["--mapper", "glomap"], "mapper"),
-        (["--camera-model", "FOV"], "camera_model"),
-        (["--max-features", "0"], "max_features"),
-        (["--max-image-size", "8"], "max_image_size"),
+        (["--camera-model", "FOV"], "--camera-model: "),
+        (["--max-features", "0"], "--max-features: "),
+        (["--max-image-size", "8"], "--max-image-size: "),
         (["--threads", "-1"], "threads"),
     ],
 )

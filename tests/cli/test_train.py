@@ -209,7 +209,7 @@ def test_numbers_are_finite(words, number, capsys):
         (["--time-limit", "soon"], "--time-limit"),
         (["--image-memory", "much"], "--image-memory"),
         (["--resolution", "-2"], "resolution"),
-        (["--test-every", "1"], "test_every"),
+        (["--test-every", "1"], "--test-every: "),
         (["--backend", "gpu"], "backend"),
         (["--max-gaussians", "0"], "--max-gaussians: "),
         (["--set", "densify_start=20000"], "--set fast_stop: "),

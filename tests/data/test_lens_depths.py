@@ -161,7 +161,7 @@ def test_tracks_give_the_depth_of_points_behind(tmp_path, projection):
 def test_maps_of_a_panorama_that_is_cut_into_faces_are_refused(tmp_path):
     cameras = write_room(tmp_path / "room", PANORAMA, 3, 48)
     maps = write_room_maps(tmp_path / "maps", cameras)
-    with pytest.raises(DatasetError, match="faces, which have no depth maps; train with --lens native"):
+    with pytest.raises(DatasetError, match="faces, which have no depth maps; train with `lens=native`"):
         given(tmp_path / "room", DepthSource(maps), DataSettings(test_every=0))
 
 

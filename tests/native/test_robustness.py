@@ -182,7 +182,7 @@ def test_parameters_need_not_be_contiguous():
 
 
 def test_other_dtypes_are_refused():
-    with pytest.raises(ArgumentError, match="all float32 or all float64"):
+    with pytest.raises(ArgumentError, match=r"^means: is float16, .*; use means.float\(\)$"):
         render(random(3).gaussians(torch.float16), camera(9, 9), backend="cpu")
     zeros, ball, view = torch.zeros(1, 3), torch.eye(3)[None], camera(9, 9)
     with pytest.raises(ArgumentError, match="all float32 or all float64"):

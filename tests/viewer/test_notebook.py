@@ -3,6 +3,7 @@
 import html
 import inspect
 import io
+import os
 import pydoc
 import re
 import subprocess
@@ -21,7 +22,7 @@ from gsplat_edu.data.writers import write_colmap
 from gsplat_edu.scene.shutter import RollingShutter
 from gsplat_edu.train.initialize import random_ball
 from viewer.pages import RESTS
-from waiting import until_in
+from waiting import until, until_in
 
 
 @pytest.fixture
@@ -81,7 +82,7 @@ def test_a_render_with_a_bad_pixel_leaves_the_file_as_it_was(ball, output, tmp_p
 
 
 def test_without_a_screen_show_says_what_to_do(output, monkeypatch, capsys):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if sys.platform not in ("win32", "darwin"):
         output.show()
@@ -97,16 +98,17 @@ gsplat_edu.render(ball, gsplat_edu.Camera.looking_at((0, 0, -3), (0, 0, 0), 40, 
 
 
 @pytest.mark.own_process
-@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="BROWSER is POSIX")
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="these have viewers of their own")
 def test_show_opens_the_picture(output, tmp_path, monkeypatch):
-    opener = tmp_path / "browser"
-    opener.write_text(f'#!/bin/sh\ncp "${{1#file://}}" {tmp_path / "opened.png"}\n')
+    opener, opened = tmp_path / "xdg-open", tmp_path / "opened.png"
+    opener.write_text(f'#!/bin/sh\ncp "$1" {tmp_path / "part"} && mv {tmp_path / "part"} {opened}\n')
     opener.chmod(0o755)
-    monkeypatch.setenv("BROWSER", f"{opener} %s")
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     subprocess.run([sys.executable, "-c", SHOWS], check=True)
-    assert np.array_equal(pixels((tmp_path / "opened.png").read_bytes()), pixels(output._repr_png_()))
-    assert not list(tmp_path.glob("gsplat-edu-*")), "the picture is removed when the process ends"
+    until(opened.is_file)
+    assert np.array_equal(pixels(opened.read_bytes()), pixels(output._repr_png_()))
 
 
 def test_a_scene_is_a_small_picture_with_its_facts(ball):

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import atexit
 import base64
 import html
 import importlib
 import io
 import math
 import os
-import shutil
 import sys
-import tempfile
-import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -143,7 +139,7 @@ def in_notebook() -> bool:
 
 
 def show(value: object, image: ArrayLike, instead: str) -> None:
-    """Show a value in the notebook, or its image in the browser; without a screen, print what to do.
+    """Show a value in the notebook, or its image in the system's viewer; without a screen, print what to do.
 
     Args:
         value: What the notebook shows.
@@ -153,14 +149,11 @@ def show(value: object, image: ArrayLike, instead: str) -> None:
     if in_notebook():
         sys.modules["IPython"].display.display(value)
         return
-    screen = sys.platform in ("win32", "darwin") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
-    )
+    screen = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     if screen:
-        folder = Path(tempfile.mkdtemp(prefix="gsplat-edu-"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        write_png(folder / "picture.png", image)
-        if webbrowser.open((folder / "picture.png").as_uri()):
+        from PIL import Image, ImageShow  # here, because it takes long to import
+
+        if ImageShow.show(Image.fromarray(to_bytes(image))):
             return
     say(f"show: there is no notebook and no screen; {instead}")
 

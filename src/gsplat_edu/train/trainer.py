@@ -183,9 +183,12 @@ class Trainer:
                         self._tell(event, receivers)
                     if stop():
                         break
-        finally:  # a notebook's user may interrupt it and look at the curve
+        except KeyboardInterrupt:  # a notebook's user may look at the curve
             self._losses += losses.read()
-        return TrainResult(losses.read(), counts, time.perf_counter() - start)
+            raise
+        found = losses.read()
+        self._losses += found
+        return TrainResult(found, counts, time.perf_counter() - start)
 
     def _step(self) -> StepEvent:
         """Take one step: draw the views, and let the stepper move the Gaussians."""
