@@ -27,6 +27,14 @@ TRAININGS = {
     "train_3d.py": ("--iters", "3", "--size", "16", "--k0", "10"),
 }
 
+PATHS = [p.parent if p.name == "__main__.py" else p for p in BENCHMARKS if p.name not in SHARED]
+TRIED = [
+    pytest.param(path, id=name, marks=() if name in MADE else pytest.mark.soak)
+    for path in PATHS
+    for name in [str(path.relative_to(ROOT))]
+]
+"""Outside of soaks, only those that `make bench` runs."""
+
 SMALLEST = {"surfaces.py": ("--captures", "box")}
 """What makes a benchmark's trial run shorter than `--smoke` alone."""
 
@@ -79,11 +87,7 @@ def script(path, *words, folder):
 
 @pytest.mark.slow
 @pytest.mark.own_process
-@pytest.mark.parametrize(
-    "path",
-    [p.parent if p.name == "__main__.py" else p for p in BENCHMARKS if p.name not in SHARED],
-    ids=lambda p: str(p.relative_to(ROOT)),
-)
+@pytest.mark.parametrize("path", TRIED)
 def test_a_benchmark_runs(path, tmp_path):
     out = tmp_path / "deep" / "figures.json"
     code, said, complained = script(

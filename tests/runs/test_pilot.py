@@ -100,7 +100,7 @@ def test_a_lens_is_learned_if_it_is_wrong(tmp_path, k1, kept):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pixels", [12.0, 0.0])
+@pytest.mark.parametrize("pixels", [12.0, pytest.param(0.0, marks=pytest.mark.soak)])
 def test_a_shutter_is_learned_if_photos_have_one(tmp_path, pixels):
     """Photos without one give no sign of it, so no training with a motion is spent on them."""
     write_moving_room(tmp_path / "capture", pixels)

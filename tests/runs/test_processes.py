@@ -215,7 +215,7 @@ of the next step, so the run cannot end before.
 @pytest.mark.own_process
 @pytest.mark.parametrize(
     ("size", "victim"),
-    [*(pytest.param(*case, marks=pytest.mark.soak) for case in ((2, 0), (4, None))), (2, 1), (4, 3)],
+    [*(pytest.param(*case, marks=pytest.mark.soak) for case in ((2, 0), (4, None), (4, 3))), (2, 1)],
 )
 def test_torchrun_trains_to_the_same_bytes_although_a_rank_is_killed(capture, tmp_path, size, victim):
     assert main(["train", str(capture), "--out", str(tmp_path / "alone"), *WORDS]) == 0

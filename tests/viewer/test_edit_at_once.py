@@ -69,7 +69,13 @@ ALL = {"op": "select", "how": "replace", "by": "all"}
 
 @pytest.mark.parametrize(
     ("operation", "look"),
-    [(SMALL, "tint"), (MANY, "tint"), (ALL, "tint"), (SMALL, "centres"), (MANY, "outline")],
+    [
+        pytest.param(SMALL, "tint", marks=pytest.mark.soak),
+        pytest.param(MANY, "tint", marks=pytest.mark.soak),
+        (ALL, "tint"),
+        (SMALL, "centres"),
+        (MANY, "outline"),
+    ],
     ids=["one", "many", "all", "one by its centre", "many by their outline"],
 )
 def test_a_selection_shows_before_the_picture_is_whole(cloud, operation, look):
