@@ -178,13 +178,13 @@ class Dataset:
 
         Args:
             split: "train" or "test".
-            crop: (height, width) px of a part of each photo; None for whole photos.
-            corner: (row, column) of the part's first pixel; None to draw it at random.
+            crop: (height, width) of the crops, px; None for whole photos.
+            corner: (row, column) of the first pixel of every crop; None draws one at random for each view and epoch.
             background: (3,) colour behind transparent photos, 0 to 1.
             seed: Seed of the random corners; `ViewDataset.set_epoch` draws others.
 
         Raises:
-            ArgumentError: the split has another name, a number is out of range, a photo is smaller than its part, or a
+            ArgumentError: the split has another name, a number is out of range, a photo is smaller than the crop, or a
                 camera cannot be cropped.
             ShapeError: crop, corner or background has another number of entries.
         """

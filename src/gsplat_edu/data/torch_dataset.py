@@ -55,13 +55,13 @@ class ViewDataset(torch.utils.data.Dataset[ViewTensors]):
 
     Args:
         views: The views.
-        crop: (height, width) px of the parts; None for whole photos.
-        corner: (row, column) of the first pixel of every part; None to draw it at random.
+        crop: (height, width) of the crops, px; None for whole photos.
+        corner: (row, column) of the first pixel of every crop; None draws one at random for each view and epoch.
         background: (3,) colour behind transparent photos, 0 to 1.
         seed: Seed of the random corners.
 
     Raises:
-        ArgumentError: a number is out of range, a photo is smaller than its part, or a camera cannot be cropped.
+        ArgumentError: a number is out of range, a photo is smaller than the crop, or a camera cannot be cropped.
         ShapeError: crop, corner or background has another number of entries.
     """
 
@@ -92,7 +92,7 @@ class ViewDataset(torch.utils.data.Dataset[ViewTensors]):
         return len(self.views)
 
     def __repr__(self) -> str:
-        """Return one line: the number of views, and the size of their parts."""
+        """Return one line: the number of views, and the size of their crops."""
         parts = "" if self.crop is None else f", crops of {self.crop[1]}x{self.crop[0]} px"
         return f"ViewDataset({len(self)} views{parts})"
 
@@ -132,7 +132,7 @@ class ViewDataset(torch.utils.data.Dataset[ViewTensors]):
         return ViewTensors(image, camera, torch.tensor(mask), view.name)
 
     def _corner(self, index: int, camera: Camera) -> tuple[int, int]:
-        """Return row and column of the first pixel of a view's part."""
+        """Return row and column of the first pixel of a view's crop."""
         if self.corner is not None or self.crop is None:
             return self.corner or (0, 0)
         random = np.random.default_rng((self.seed, int(self._epoch), index))
