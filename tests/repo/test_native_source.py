@@ -13,6 +13,7 @@ ISA_FREE = {
         f"{name}.{end}"
         for name in (
             *(
+                "bindings_screen",
                 "bindings_surface",
                 "bindings_volume",
                 "buffers",

@@ -131,6 +131,7 @@ class _Drawn(NamedTuple):
     scenes: Int64[Tensor, " nnz"]
     images: Int64[Tensor, " nnz"]  # batch times C plus camera
     gaussians: Int64[Tensor, " nnz"]
+    ends: list[int]  # of each image
 
 
 def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -146,9 +147,11 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     solids = solids_of(a.means, triangle, a.quats, a.scales)
     found = project(solids, viewmats, Ks, lens, flat, antialiased, model)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
-    check_spreads("scales" if a.covars is None else "covars", found.spreads, positions, a.batch)
+    spreads = _rows(found.spreads, 3).index_select(0, positions)
+    check_spreads("scales" if a.covars is None else "covars", spreads, positions, (a.batch, a.C, a.N))
     images = positions // max(a.N, 1)
-    drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1))
+    ends = torch.bincount(images, minlength=a.batches * a.C).cumsum(0).tolist()
+    drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1), ends)
     opacities = flat[:, None].expand(-1, a.C, -1)
     if antialiased:
         opacities = opacities * found.compensations
@@ -163,15 +166,13 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     if a.packed:
         meta = {"batch_ids": drawn.scenes, "camera_ids": images % a.C, "gaussian_ids": drawn.gaussians}
         meta |= {name: _rows(field, 3).index_select(0, positions) for name, field in fields.items()}
-        rows = torch.arange(len(positions))
     else:
         meta |= {name: field.view(*a.batch, a.C, a.N, *field.shape[3:]) for name, field in fields.items()}
-        rows = positions
     meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
     meta |= {"n_batches": a.batches, "n_cameras": a.C}
     for name, size in (("tile_width", a.width), ("tile_height", a.height)):
         meta[name] = math.ceil(size / a.tile_size)
-    views = _draw(a, lens, drawn, (rows, found.spreads), meta)
+    views = _draw(a, lens, drawn, spreads, meta)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
     alphas = 1.0 - transmittance[..., None]
     if a.extra_signals is not None:
@@ -193,35 +194,35 @@ def _draw(
     a: Arguments,
     lens: Lens,
     drawn: _Drawn,
-    inputs: tuple[Int64[Tensor, " nnz"], Float[Tensor, "B C N 3"]],
+    spreads: Float[Tensor, "nnz 3"],
     meta: dict[str, Any],
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Draw every image; `inputs` are the rows of the drawn Gaussians in the tensors of `meta`, and spreads."""
-    rows, spreads = inputs
-    axes = 1 if a.packed else len(a.batch) + 2
-    means2d, depths, opacities = (_rows(meta[name], axes) for name in ("means2d", "depths", "opacities"))
+    """Draw every image, given the spreads of the drawn Gaussians."""
+    own = [meta[name] for name in ("means2d", "depths", "opacities")]
+    rows = torch.arange(len(spreads)) if a.packed else drawn.positions  # in the tensors of `meta`
+    if not a.packed:
+        own = [_rows(each, len(a.batch) + 2).index_select(0, rows) for each in own]
+    means2d, depths, opacities = own
     with_depth = a.render_mode != "RGB"
     colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else _colors(a, a.colors, drawn)
     signals = None if a.extra_signals is None else _extra_signals(a, a.extra_signals, drawn)
     backgrounds = None if a.backgrounds is None else _rows(a.backgrounds, len(a.batch) + 1)
     if colors is None and signals is None:
         backgrounds = None  # a depth has no background
-    ends = torch.bincount(drawn.images, minlength=a.batches * a.C).cumsum(0).tolist()
     images, transmittances = [], []
-    for k, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        # Near to far; ties in the order of the Gaussians.
-        order = begin + torch.argsort(depths.detach()[rows[begin:end]], stable=True)
-        own = rows[order]
+    for k, (begin, end) in enumerate(zip([0, *drawn.ends], drawn.ends, strict=False)):
+        part = slice(begin, end)
         splats = Splats(
-            means2d.index_select(0, own),
-            _rows(spreads, 3).index_select(0, drawn.positions[order]),
-            opacities.index_select(0, own),
-            None if colors is None else colors.index_select(0, order),
-            depths.index_select(0, own) if with_depth else None,
+            means2d[part],
+            spreads[part],
+            opacities[part],
+            None if colors is None else colors[part],
+            depths[part] if with_depth else None,
             None if backgrounds is None else backgrounds[k],
-            None if signals is None else signals.index_select(0, order),
+            None if signals is None else signals[part],
+            order=depths.detach()[part] + 0.0,  # not -0
         )
-        store = absgrad_store(meta["means2d"], own) if a.absgrad else None
+        store = absgrad_store(meta["means2d"], rows[part]) if a.absgrad else None
         image, transmittance = composite(splats, lens, store)
         images.append(image)
         transmittances.append(transmittance)
@@ -233,8 +234,8 @@ def _colors(a: Arguments, colors: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz D
     row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
     if a.sh_degree is None:
         return _rows(colors, colors.ndim - 1).index_select(0, row)
-    coefficients = _rows(colors, colors.ndim - 2).index_select(0, row)
-    return torch.clamp_min(evaluate(a.sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET, 0.0)
+    values = evaluate(a.sh_degree, _directions(a, drawn), _rows(colors, colors.ndim - 2), (row, drawn.ends))
+    return torch.clamp_min(values + SH_OFFSET, 0.0)
 
 
 def _extra_signals(a: Arguments, signals: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz E"]:
@@ -242,8 +243,8 @@ def _extra_signals(a: Arguments, signals: Tensor, drawn: _Drawn) -> Float[Tensor
     if a.extra_signals_sh_degree is None:
         row = (drawn.images if a.extra_signals_per_camera else drawn.scenes) * a.N + drawn.gaussians
         return _rows(signals, signals.ndim - 1).index_select(0, row)
-    coefficients = signals.index_select(0, drawn.gaussians)
-    return evaluate(a.extra_signals_sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET
+    rows = (drawn.gaussians, drawn.ends)
+    return evaluate(a.extra_signals_sh_degree, _directions(a, drawn), signals, rows) + SH_OFFSET
 
 
 def _directions(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz 3"]:

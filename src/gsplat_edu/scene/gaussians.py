@@ -201,10 +201,19 @@ def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     Differentiable in: quats.
     """
     check_tensor("quats", quats, ("N", 4), {})
-    largest = quats.detach().abs().amax(dim=-1, keepdim=True)
-    if not bool((largest > 0).all()):
-        raise ArgumentError(f"quats{first_index((largest[:, 0] == 0).numpy(force=True))}: has zero length")
+    check_lengths(quats)
     return unchecked_rotations(quats)
+
+
+def check_lengths(quats: Float[Tensor, "... 4"]) -> None:
+    """Check that no quaternion has zero length.
+
+    Raises:
+        ArgumentError: one has.
+    """
+    zero = (quats.detach() == 0).all(dim=-1)
+    if bool(zero.any()):
+        raise ArgumentError(f"quats{first_index(zero.numpy(force=True))}: has zero length")
 
 
 def unchecked_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
