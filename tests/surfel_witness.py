@@ -16,15 +16,17 @@ depth_to_normal = pytest.importorskip("gsplat.utils").depth_to_normal
 NAMES = ("images", "alphas", "normals", "surf_normals", "distortions", "medians")
 
 
-def projected(t, width, height, **limits):
+def projected(t, width, height, radius_clip=0.0, **limits):
     """Return radii, means2d, depths, ray transforms and normals of gsplat.
 
-    Its torch code multiplies a normal by the third scale, its kernels do not; with a scale of 1 they agree.
+    Its torch code multiplies a normal by the third scale, its kernels do not; with a scale of 1 they agree. And only
+    the kernels leave out splats whose box has half sizes of at most radius_clip.
     """
     scales = torch.cat([t["scales"][:, :2], torch.ones_like(t["scales"][:, 2:])], dim=-1)
-    return impl._fully_fused_projection_2dgs(
+    radii, *others = impl._fully_fused_projection_2dgs(
         t["means"], t["quats"], scales, t["viewmats"], t["Ks"], width, height, **limits
     )
+    return radii * (radii > radius_clip).any(dim=-1, keepdim=True), *others
 
 
 def composited(splats, radii, width, height, tile_size=16):

@@ -153,7 +153,7 @@ def _arguments(arrays: dict[str, Tensor], lists: TileLists) -> dict[str, Any]:
 
 
 def shifted(transforms: Float[Tensor, "*M 3 3"], densify: Float[Tensor, "*M 2"]) -> Float[Tensor, "*M 3 3"]:
-    """Return the transforms; `densify` gets the gradient for a shift of each splat's mean on the screen, per px."""
+    """Return the transforms; `densify` gets the gradient for a move of a splat along the image plane, per px."""
     shift = (densify - densify.detach()) * transforms[..., 2, 2, None].detach()
     return transforms + torch.nn.functional.pad(shift[..., None], (2, 0, 0, 1))
 
@@ -184,7 +184,7 @@ def rasterize_to_pixels_2dgs(
         colors: (..., N, D) numbers to composite. Distortion and median are of the last, as a rule the depth.
         opacities: (..., N) 0 to 1.
         normals: (..., N, 3) normals in camera axes.
-        densify: (..., N, 2) any numbers; their gradient is that for a shift of a splat on the screen, per px.
+        densify: (..., N, 2) any numbers; they get the gradient for a move of a splat along the image plane, per px.
         image_width: Width, px.
         image_height: Height, px.
         tile_size: Edge of a tile, px.
