@@ -1,4 +1,4 @@
-"""A drop-in for gsplat 1.5.3: its `rasterization`, and the steps it is made of, on any CPU.
+"""A drop-in for gsplat 1.5.3: `rasterization`, `rasterization_2dgs` and the steps they are made of, on any CPU.
 
 `rasterization` also has the nine arguments that gsplat's main branch has added since. There they stand between those of
 1.5.3; here they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
