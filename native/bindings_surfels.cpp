@@ -33,7 +33,7 @@ struct SurfelCall {
         args.median_places = a.array("median_places", {Kind::I64}, plane, !backward).template as<int64_t>();
         args.depth = a.whole("depth", 0, args.count - 1);
         args.H = plane[1], args.W = plane[2], args.edge = a.whole("edge", 1, MOST);
-        args.tiles_x = a.whole("tiles_x", 1, MOST), args.tiles_y = a.whole("tiles_y", 1, MOST);
+        args.tiles_x = a.whole("tiles_x", 1, 1 << 24), args.tiles_y = a.whole("tiles_y", 1, 1 << 24);
         tiles = plane[0] * args.tiles_x * args.tiles_y, pairs = rows.shape[0];
         args.done = a.array("done", {Kind::I64}, {tiles}, !backward).template as<int64_t>();
         threads = int(a.whole("threads", 1, MOST_THREADS));

@@ -28,8 +28,19 @@ constexpr double FILTER = 2;          // factor of |m - p|²: a splat is never n
 // Whole numbers as wide as T, which a plane of T holds.
 template <class T>
 struct WholeOf;
-template <> struct WholeOf<float> { using I = int32_t; };
-template <> struct WholeOf<double> { using I = int64_t; };
+template <>
+struct WholeOf<float> {
+    using I = int32_t;
+};
+template <>
+struct WholeOf<double> {
+    using I = int64_t;
+};
+
+// The rows of a tile that a splat touches; none if first is larger than last.
+struct Touched {
+    int64_t first, last;
+};
 
 // One tile, and the planes of its pixels in a thread's scratch: rows of `stride` numbers.
 template <class T>
@@ -57,16 +68,18 @@ struct Patch {
             for (int64_t u = 0; u < width; ++u) f(row * stride + u, first_pixel + row * args.W + u);
     }
 
+    // Calls f(index in a plane, row, column) for each vector that has pixels in these rows.
+    template <class F>
+    GSPLAT_METHOD void vectors(Touched rows, F f) const {
+        for (int64_t row = rows.first; row <= rows.last; ++row)
+            for (int64_t column = 0; column < width; column += LANES) f(row * stride + column, row, column);
+    }
+
     GSPLAT_METHOD bool open() const {
         for (int64_t at = 0; at < height * stride; at += LANES)
             if (any_at_least(load<V>(left + at), T(0))) return true;
         return false;
     }
-};
-
-// The rows of a tile that a splat touches; none if first is larger than last.
-struct Touched {
-    int64_t first, last;
 };
 
 // Where the ray of each lane's pixel meets a splat.
@@ -99,24 +112,21 @@ GSPLAT_ONE_COPY Touched weigh(const T *record, const Patch<T> &patch) {
     Touched touched{patch.height, -1};
     if (!(record[OPACITY] >= T(ALPHA_MIN))) return touched;
     const V opacity = splat(record[OPACITY]), limit = splat(T(2 * log(double(record[OPACITY]) / ALPHA_MIN) * 1.0001 + 1e-4));
-    for (int64_t row = 0; row < patch.height; ++row)
-        for (int64_t column = 0; column < patch.width; column += Patch<T>::LANES) {
-            const int64_t at = row * patch.stride + column;
-            const Meeting<T> meeting(record, patch, row, column);
-            const V s = vmin(meeting.solid, meeting.flat), t = load<V>(patch.left + at);
-            if (!any_at_least(limit - s, T(0))) {
-                store(patch.alpha + at, V{}), store(patch.before + at, t), store(patch.weight + at, V{});
-                continue;
-            }
+    patch.vectors({0, patch.height - 1}, [&](int64_t at, int64_t row, int64_t column) {
+        const Meeting<T> meeting(record, patch, row, column);
+        const V s = vmin(meeting.solid, meeting.flat), t = load<V>(patch.left + at);
+        V alpha = V{};
+        if (any_at_least(limit - s, T(0))) {
             touched.first = vmin(touched.first, row), touched.last = row;
             const V falloff = exp2_(vmax(splat(T(-HALF_LOG2E)) * s, splat(T(-126))));
-            const V alpha = between(opacity * falloff, splat(T(ALPHA_MIN)), splat(T(ALPHA_MOST)));
-            const V wanted = alpha * t, next = t - wanted;
-            const auto open = next > splat(T(T_STOP));
-            store(patch.alpha + at, alpha), store(patch.before + at, t);
-            store(patch.weight + at, open ? wanted : V{});
-            store(patch.left + at, open ? next : (t < V{} ? t : -t));
+            alpha = between(opacity * falloff, splat(T(ALPHA_MIN)), splat(T(ALPHA_MOST)));
         }
+        const V wanted = alpha * t, next = t - wanted;
+        const auto open = next > splat(T(T_STOP));
+        store(patch.alpha + at, alpha), store(patch.before + at, t);
+        store(patch.weight + at, open ? wanted : V{});
+        store(patch.left + at, open ? next : (t < V{} ? t : -t));
+    });
     return touched;
 }
 
@@ -136,18 +146,18 @@ void surfels(const SurfelArgs<T> &args, int64_t tile, T *scratch) {
         const Touched touched = weigh(args.records + SURFEL * args.rows[k], patch);
         const T *channels = args.channels + args.count * args.rows[k];
         const V z = splat(channels[args.depth]);
-        for (int64_t at = touched.first * patch.stride; at < (touched.last + 1) * patch.stride; at += Patch<T>::LANES) {
+        patch.vectors(touched, [&](int64_t at, int64_t, int64_t) {
             const V w = load<V>(patch.weight + at), t = load<V>(patch.before + at), wz = load<V>(image + args.depth * plane + at);
             store(distortion + at, load<V>(distortion + at) + splat(T(2)) * w * (z * (splat(T(1)) - t) - wz));
-            const M middle = (w > V{}) & (t > splat(T(0.5)));
+            const auto middle = (w > V{}) & (t > splat(T(0.5)));
             store(median + at, middle ? z : load<V>(median + at));
             store(which + at, M(middle ? M{} + Whole(k - begin) : load<M>(which + at)));
-        }
+        });
         for (int64_t c = 0; c < args.count; ++c) {
             const V value = splat(channels[c]);
             T *sums = image + c * plane;
-            for (int64_t at = touched.first * patch.stride; at < (touched.last + 1) * patch.stride; at += Patch<T>::LANES)
-                store(sums + at, load<V>(sums + at) + load<V>(patch.weight + at) * value);
+            patch.vectors(touched,
+                          [&](int64_t at, int64_t, int64_t) { store(sums + at, load<V>(sums + at) + load<V>(patch.weight + at) * value); });
         }
     }
     args.done[tile] = k - begin;
@@ -209,28 +219,25 @@ GSPLAT_INLINE void pair_backward(const SurfelArgs<T> &args, const Patch<T> &patc
     const Touched touched = weigh(record, patch);
     const V z = splat(channels[args.depth]), one = splat(T(1)), two = splat(T(2)), four = splat(T(4));
     PairSums<T> pair_sums;
-    for (int64_t row = touched.first; row <= touched.last; ++row)
-        for (int64_t column = 0; column < patch.width; column += Patch<T>::LANES) {
-            const int64_t at = row * patch.stride + column;
-            const V w = load<V>(patch.weight + at), alpha = load<V>(patch.alpha + at), hidden = one - load<V>(patch.before + at);
-            const V g = load<V>(gradient.distortion + at), passed = load<V>(gradient.passed + at), all = load<V>(gradient.weights + at);
-            V q = g * (four * (z * hidden - passed) + two * (load<V>(gradient.depth + at) - z * all));
-            for (int64_t c = 0; c < args.count; ++c) q += load<V>(gradient.image + c * patch.plane + at) * splat(channels[c]);
-            const V drawn = w * q, rest = load<V>(gradient.rest + at) - drawn;
-            store(gradient.rest + at, rest), store(gradient.passed + at, passed + w * z);
-            const M median = load<M>(gradient.which + at) == M{} + typename WholeOf<T>::I(place);
-            pair_sums.depth += two * w * g * (two * hidden - all + w) + (median ? load<V>(gradient.median + at) : V{});
-            const auto free = (w > V{}) & (alpha < splat(T(ALPHA_MOST)));
-            pair_sums.add(Meeting<T>(record, patch, row, column), free ? drawn - rest * odds(alpha) : V{});
-        }
+    patch.vectors(touched, [&](int64_t at, int64_t row, int64_t column) {
+        const V w = load<V>(patch.weight + at), alpha = load<V>(patch.alpha + at), hidden = one - load<V>(patch.before + at);
+        const V g = load<V>(gradient.distortion + at), passed = load<V>(gradient.passed + at), all = load<V>(gradient.weights + at);
+        V q = g * (four * (z * hidden - passed) + two * (load<V>(gradient.depth + at) - z * all));
+        for (int64_t c = 0; c < args.count; ++c) q += load<V>(gradient.image + c * patch.plane + at) * splat(channels[c]);
+        const V drawn = w * q, rest = load<V>(gradient.rest + at) - drawn;
+        store(gradient.rest + at, rest), store(gradient.passed + at, passed + w * z);
+        const auto median = load<M>(gradient.which + at) == M{} + typename WholeOf<T>::I(place);
+        pair_sums.depth += two * w * g * (two * hidden - all + w) + (median ? load<V>(gradient.median + at) : V{});
+        const auto free = (w > V{}) & (alpha < splat(T(ALPHA_MOST)));
+        pair_sums.add(Meeting<T>(record, patch, row, column), free ? drawn - rest * odds(alpha) : V{});
+    });
     T *slot = args.slots + (SURFEL + args.count) * args.slot_of[pair];
     for (int k = 0; k < SURFEL; ++k) slot[k] = sum(pair_sums.sums[k]);
     if (touched.first <= touched.last) slot[OPACITY] /= record[OPACITY];
     for (int64_t c = 0; c < args.count; ++c) {
         V total = c == args.depth ? pair_sums.depth : V{};
         const T *g = gradient.image + c * patch.plane;
-        for (int64_t at = touched.first * patch.stride; at < (touched.last + 1) * patch.stride; at += Patch<T>::LANES)
-            total += load<V>(patch.weight + at) * load<V>(g + at);
+        patch.vectors(touched, [&](int64_t at, int64_t, int64_t) { total += load<V>(patch.weight + at) * load<V>(g + at); });
         slot[SURFEL + c] = sum(total);
     }
 }

@@ -14,6 +14,7 @@ ISA_FREE = {
         for name in (
             *(
                 "bindings_surface",
+                "bindings_surfels",
                 "bindings_volume",
                 "buffers",
                 "dispatch",
