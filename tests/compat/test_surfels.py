@@ -347,9 +347,10 @@ def test_masked_tiles_show_the_background():
     assert all(bool((each[inside] == 0).all()) for each in cut[1:])
 
 
-def test_nothing_to_draw():
-    t = many(count=3)
-    t["means"] = t["means"].detach() - torch.tensor([0.0, 0.0, 90.0])
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_to_draw(count):
+    t = many(count=count)
+    t["means"] = (t["means"].detach() - torch.tensor([0.0, 0.0, 90.0])).requires_grad_()
     background = torch.tensor([[0.2, 0.4, 0.6]])
     for packed in (False, True):
         image, alphas, *_, meta = rasterization_2dgs(
@@ -359,6 +360,17 @@ def test_nothing_to_draw():
         assert not bool(alphas.any())
         image.sum().backward()
         assert len(meta["flatten_ids"]) == 0
+
+
+def test_normals_of_depths_need_three_pixels():
+    t = many()
+    for size in ((1, 5), (5, 2), (2, 2)):
+        *_, surf_normals, _, _, meta = rasterization_2dgs(
+            **t, width=size[0], height=size[1], render_mode="RGB+D"
+        )
+        assert surf_normals.shape == (size[1], size[0], 3)
+        assert not bool(surf_normals.any())
+        assert len(meta["flatten_ids"]) > 0
 
 
 def test_bad_gaussians_are_skipped_on_request():

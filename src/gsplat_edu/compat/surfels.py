@@ -97,12 +97,12 @@ def project_surfels(
 
     Differentiable in: means, quats, scales, cameras. The side that a normal faces is a constant.
     """
-    N = means.shape[-2]
     viewmats, Ks = (joined(matrix, matrix.ndim - 3).double() for matrix in cameras)
+    shape = (len(viewmats), 1, means.shape[-2])
     turn, shift = viewmats[:, :, None, :3, :3], viewmats[:, :, None, :3, 3]
-    points = means.reshape(-1, 1, N, 3).double() @ viewmats[..., :3, :3].mT + shift
-    axes = turn @ quat_to_R_t(quats.reshape(-1, 4).double()).view(-1, 1, N, 3, 3)
-    flat = axes[..., :2] * scales.reshape(-1, 1, N, 1, 3)[..., :2].double()
+    points = means.reshape(*shape, 3).double() @ viewmats[..., :3, :3].mT + shift
+    axes = turn @ quat_to_R_t(quats.reshape(-1, 4).double()).view(*shape, 3, 3)
+    flat = axes[..., :2] * scales.reshape(*shape, 1, 3)[..., :2].double()
     x, y, w = torch.cat([flat, points[..., None]], dim=-1).unbind(-2)
     u, v = (Ks[:, :, None, k, k, None] * row + Ks[:, :, None, k, 2, None] * w for k, row in enumerate((x, y)))
     signs = w.new_tensor([1.0, 1.0, -1.0])
@@ -315,7 +315,7 @@ def _lists(a: Arguments, drawn: Drawn, own: dict[str, Tensor]) -> tuple[TileList
 
 
 def _normals_of_depths(depths: Tensor, poses: Tensor, Ks: Tensor) -> Tensor:
-    """Return gsplat's normals of depth maps by central differences, zero on the border.
+    """Return gsplat's normals of depth maps by central differences, zero at the edges of an image.
 
     Args:
         depths: (..., H, W, 1) z.
@@ -326,6 +326,8 @@ def _normals_of_depths(depths: Tensor, poses: Tensor, Ks: Tensor) -> Tensor:
         (..., H, W, 3) unit vectors in world axes.
     """
     H, W = depths.shape[-3:-1]
+    if min(H, W) < 3:
+        return torch.zeros_like(depths).expand(*depths.shape[:-1], 3)
     places = torch.meshgrid(*(torch.arange(n, dtype=depths.dtype) + 0.5 for n in (W, H)), indexing="xy")
     ratios = [(at - Ks[..., k, 2, None, None]) / Ks[..., k, k, None, None] for k, at in enumerate(places)]
     rays = torch.stack([*ratios, torch.ones_like(ratios[0])], dim=-1)
