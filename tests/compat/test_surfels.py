@@ -261,6 +261,38 @@ def test_every_instruction_set_gives_the_image(isa):
         )
 
 
+@pytest.mark.parametrize("isa", _native.isas())
+def test_what_earlier_calls_left_in_memory_has_no_effect(isa):
+    """Rows of a tile end before those of its planes in memory, which the kernels reuse; here NaN is left there."""
+    t, before, threads = many(torch.float64), _native.isa(), torch.get_num_threads()
+    nan = torch.full((16, 16, 110), float("nan"), dtype=torch.float64)  # as much memory as the render's
+    plane = {name: nan[None, ..., 0].clone() for name in ("transmittance", "distortion", "median")}
+    lists = {
+        "tile_begin": torch.tensor([0, 0]),
+        "rows": torch.zeros(0, dtype=torch.int64),
+        "done": torch.tensor([0]),
+    }
+    numbers = {"depth": 0, "edge": 16, "tiles_x": 1, "tiles_y": 1, "threads": threads}
+    try:
+        _native.choose_isa(isa)
+        seen = []
+        for _ in range(2):
+            image = rasterization_2dgs(**t, width=39, height=37, tile_size=36)[0]
+            seen += [image, *torch.autograd.grad(image.sum(), [t["means"], t["colors"]])]
+            _native.surfels_backward_f64(
+                **plane | lists | numbers | {f"grad_{name}": array for name, array in plane.items()},
+                records=torch.ones(1, 14, dtype=torch.float64),
+                channels=nan[0, :1].contiguous(),
+                image=nan[None],
+                grad_image=nan[None],
+                median_places=torch.zeros(1, 16, 16, dtype=torch.int64),
+                out=torch.empty(1, 124, dtype=torch.float64),
+            )
+    finally:
+        _native.choose_isa(before)
+    assert all(torch.equal(a, b) for a, b in zip(seen[:3], seen[3:], strict=True))
+
+
 def test_float32_is_near_float64():
     """A rounding of 2^-24 in s, which is below 11 where a splat is drawn, changes alpha by less than 11 / 2 times as
     much; the kernels' exponential adds 2.4e-7. With ten operations before s the sum stays below 4e-6 per splat, and the
