@@ -115,16 +115,17 @@ GSPLAT_ONE_COPY Touched weigh(const T *record, const Patch<T> &patch) {
     patch.vectors({0, patch.height - 1}, [&](int64_t at, int64_t row, int64_t column) {
         const Meeting<T> meeting(record, patch, row, column);
         const V s = vmin(meeting.solid, meeting.flat), t = load<V>(patch.left + at);
-        V alpha = V{};
-        if (any_at_least(limit - s, T(0))) {
-            touched.first = vmin(touched.first, row), touched.last = row;
-            const V falloff = exp2_(vmax(splat(T(-HALF_LOG2E)) * s, splat(T(-126))));
-            alpha = between(opacity * falloff, splat(T(ALPHA_MIN)), splat(T(ALPHA_MOST)));
+        store(patch.before + at, t);
+        if (!any_at_least(limit - s, T(0))) {
+            store(patch.alpha + at, V{}), store(patch.weight + at, V{});
+            return;
         }
+        touched.first = vmin(touched.first, row), touched.last = row;
+        const V falloff = exp2_(vmax(splat(T(-HALF_LOG2E)) * s, splat(T(-126))));
+        const V alpha = between(opacity * falloff, splat(T(ALPHA_MIN)), splat(T(ALPHA_MOST)));
         const V wanted = alpha * t, next = t - wanted;
         const auto open = next > splat(T(T_STOP));
-        store(patch.alpha + at, alpha), store(patch.before + at, t);
-        store(patch.weight + at, open ? wanted : V{});
+        store(patch.alpha + at, alpha), store(patch.weight + at, open ? wanted : V{});
         store(patch.left + at, open ? next : (t < V{} ? t : -t));
     });
     return touched;
