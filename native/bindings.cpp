@@ -17,6 +17,7 @@
 
 #include "bindings_screen.h"
 #include "bindings_surface.h"
+#include "bindings_surfels.h"
 #include "bindings_volume.h"
 #include "buffers.h"
 #include "dispatch.h"
@@ -451,6 +452,7 @@ NB_MODULE(_native, m) {
     m.def("loss_f64", &loss_of<double>);
     bind_screen(m);
     bind_surface(m);
+    bind_surfels(m);
     m.def("ask_before_large_blocks", [](const nb::object &function) {
         free_memory_function = function.inc_ref().ptr();
         ask_before_large_blocks(&free_memory);

@@ -360,6 +360,28 @@ struct HarmonicArgs {
     int used() const { return (degree + 1) * (degree + 1); }
 };
 
+// Numbers of a surfel's record: the lines A, B and C, the centre less the reference point, the opacity, the reference point. In a
+// slot of gradients, the last two are sums of the absolute values of the centre's gradient.
+enum Surfel { LINES, CENTRE = 9, OPACITY = 11, REFERENCE = 12, SURFEL = 14 };
+
+// 2D Gaussians of several images and their lists of tiles, image after image and row by row; surfels.cpp has the formulas.
+template <class T>
+struct SurfelArgs {
+    const T *records, *channels;                       // M SURFEL, M count
+    int64_t count, depth;                              // number of channels; which one distortion and median are of
+    const int64_t *tile_begin, *rows;                  // tiles + 1; rows of the records, each tile's near to far
+    int64_t H, W, edge, tiles_x, tiles_y;              // of one image, px and tiles
+    T *image, *transmittance, *distortion, *median;    // images H W count, and images H W
+    int64_t *median_places, *done;                     // images H W: place in the tile's list, -1 for none; tiles: pairs composited
+    const T *grad_image, *grad_transmittance, *grad_distortion, *grad_median;  // the rest is for the backward pass only
+    const int64_t *slot_of;                            // pairs
+    T *slots;                                          // pairs (SURFEL + count)
+
+    int64_t stride() const { return ((edge < W ? edge : W) + 15) / 16 * 16; }  // a multiple of every vector width
+    int64_t plane() const { return stride() * (edge < H ? edge : H); }         // numbers of a tile's plane
+    int64_t scratch() const { return (count + 12) * plane(); }                 // numbers that a thread needs
+};
+
 constexpr int64_t BLOCK = 256;  // Gaussians per task
 
 // The kernels of one instruction set and scalar type.
@@ -387,6 +409,8 @@ struct Kernels {
     void (*radii)(const RadiusArgs<T> &, int64_t begin, int64_t end);
     void (*harmonic_colors)(const HarmonicArgs<T> &, int64_t block);
     void (*harmonic_colors_backward)(const HarmonicArgs<T> &, int64_t block);
+    void (*surfels)(const SurfelArgs<T> &, int64_t tile, T *scratch);
+    void (*surfels_backward)(const SurfelArgs<T> &, int64_t tile, T *scratch);
     int64_t rows_bytes;  // of a batch, in CompositeArgs::rows; 0 if none are kept
 };
 

@@ -33,6 +33,8 @@ static constexpr Kernels<T> kernels() {
             radii<T>,
             harmonic_colors<T>,
             harmonic_colors_backward<T>,
+            surfels<T>,
+            surfels_backward<T>,
             KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
 }
 

@@ -15,6 +15,7 @@ ISA_FREE = {
             *(
                 "bindings_screen",
                 "bindings_surface",
+                "bindings_surfels",
                 "bindings_volume",
                 "buffers",
                 "dispatch",
