@@ -13,7 +13,6 @@ from gsplat_edu.compat.gsplat import RollingShutterType, fully_fused_projection,
 pytestmark = pytest.mark.usefixtures("as_shipped")
 
 UNSUPPORTED = {
-    "sparse_grad": True,
     "distributed": True,
     "with_eval3d": True,
     "ftheta_coeffs": object(),

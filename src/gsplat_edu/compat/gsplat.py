@@ -1,7 +1,7 @@
-"""A drop-in for gsplat 1.5.3: its `rasterization`, and the steps it is made of, on any CPU.
+"""A drop-in for gsplat 1.6.0 and 1.5.3: `rasterization`, and the steps it is made of, on any CPU.
 
-`rasterization` also has the nine arguments that gsplat's main branch has added since. There they stand between those of
-1.5.3; here they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
+`rasterization` also has the nine arguments that gsplat 1.6.0 has added. There they stand between those of 1.5.3; here
+they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
 
     from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
 
@@ -15,8 +15,8 @@ So the stages here are the same. Projection and harmonics are torch operations (
 `meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are nodes of the graph between them and the image.
 Compositing is our native kernels (images.py), whose gradient with respect to a mean on the screen arrives at
 `meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad, hooks and losses on these tensors work
-without special cases. `absgrad` is a statistic that the kernels collect; a hook on their input stores it as an
-attribute after each backward pass.
+without special cases. `absgrad` is a statistic that the kernels collect; hooks on their inputs add it up, and a hook on
+the centres assigns the sums to the attribute at the end of each backward pass.
 
 The renderer's own projection is not used: it computes in double without temporary arrays, but returns no centres that a
 graph could pass through. Training with `gsplat_edu.render.api.render` is faster.
@@ -25,6 +25,7 @@ graph could pass through. Training with `gsplat_edu.render.api.render` is faster
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -34,11 +35,23 @@ from torch import Tensor
 from gsplat_edu.base.constants import SH_OFFSET
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
-from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
-from gsplat_edu.compat.images import Splats, absgrad_store, composite
+from gsplat_edu.compat.harmonics import (
+    evaluate,
+    spherical_harmonics,
+    spherical_harmonics_l0,
+    spherical_harmonics_l1_plus,
+)
+from gsplat_edu.compat.images import Absgrad, Splats, composite
 from gsplat_edu.compat.lenses import cameras_of
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
-from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
+from gsplat_edu.compat.projection import (
+    TRIANGLE,
+    Lens,
+    fully_fused_projection,
+    project,
+    solids_of,
+    with_sparse_gradient,
+)
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from gsplat_edu.render.api import BYTES_PER_PIXEL
@@ -55,6 +68,8 @@ __all__ = [
     "rasterize_to_pixels",
     "skipping_bad_gaussians",
     "spherical_harmonics",
+    "spherical_harmonics_l0",
+    "spherical_harmonics_l1_plus",
     "world_to_cam",
 ]
 
@@ -78,7 +93,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = 16,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -139,6 +154,11 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
         BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
         "render fewer images, or fewer pixels (width, height)",
     )
+    touched: list[Tensor] = []
+    if a.sparse_grad:
+        shapes = {name: getattr(a, name) for name in ("means", "quats", "scales", "covars")}
+        used = {name: tensor for name, tensor in shapes.items() if tensor is not None}
+        a = replace(a, **{name: with_sparse_gradient(tensor, touched) for name, tensor in used.items()})
     lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)
@@ -149,6 +169,7 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     check_spreads("scales" if a.covars is None else "covars", found.spreads, positions, a.batch)
     images = positions // max(a.N, 1)
     drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1))
+    touched.append(drawn.gaussians.bincount().nonzero()[:, 0])
     opacities = flat[:, None].expand(-1, a.C, -1)
     if antialiased:
         opacities = opacities * found.compensations
@@ -170,7 +191,7 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
     meta |= {"n_batches": a.batches, "n_cameras": a.C}
     for name, size in (("tile_width", a.width), ("tile_height", a.height)):
-        meta[name] = math.ceil(size / a.tile_size)
+        meta[name] = math.ceil(size / meta["tile_size"])
     views = _draw(a, lens, drawn, (rows, found.spreads), meta)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
     alphas = 1.0 - transmittance[..., None]
@@ -199,7 +220,9 @@ def _draw(
     """Draw every image; `inputs` are the rows of the drawn Gaussians in the tensors of `meta`, and spreads."""
     rows, spreads = inputs
     axes = 1 if a.packed else len(a.batch) + 2
-    means2d, depths, opacities = (_rows(meta[name], axes) for name in ("means2d", "depths", "opacities"))
+    kept = Absgrad(meta["means2d"]) if a.absgrad else None
+    means2d = _rows(meta["means2d"] if kept is None else kept.means2d, axes)
+    depths, opacities = (_rows(meta[name], axes) for name in ("depths", "opacities"))
     with_depth = a.render_mode != "RGB"
     colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else _colors(a, a.colors, drawn)
     signals = None if a.extra_signals is None else _extra_signals(a, a.extra_signals, drawn)
@@ -221,8 +244,7 @@ def _draw(
             None if backgrounds is None else backgrounds[k],
             None if signals is None else signals.index_select(0, order),
         )
-        store = absgrad_store(meta["means2d"], own) if a.absgrad else None
-        image, transmittance = composite(splats, lens, store)
+        image, transmittance = composite(splats, lens, None if kept is None else kept.adder(own))
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances
@@ -233,6 +255,8 @@ def _colors(a: Arguments, colors: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz D
     row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
     if a.sh_degree is None:
         return _rows(colors, colors.ndim - 1).index_select(0, row)
+    if colors.ndim == 3:
+        row = drawn.gaussians  # shared by all scenes
     coefficients = _rows(colors, colors.ndim - 2).index_select(0, row)
     return torch.clamp_min(evaluate(a.sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET, 0.0)
 
