@@ -35,6 +35,13 @@ from torch import Tensor
 from gsplat_edu.base.constants import SH_OFFSET
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
+from gsplat_edu.compat.contributors import (
+    accumulate,
+    rasterize_contributing_gaussian_ids,
+    rasterize_num_contributing_gaussians,
+    rasterize_to_indices_in_range,
+    rasterize_top_contributing_gaussian_ids,
+)
 from gsplat_edu.compat.harmonics import (
     evaluate,
     spherical_harmonics,
@@ -58,6 +65,7 @@ from gsplat_edu.render.api import BYTES_PER_PIXEL
 
 __all__ = [
     "RollingShutterType",
+    "accumulate",
     "compute_relocation",
     "fully_fused_projection",
     "isect_offset_encode",
@@ -65,7 +73,11 @@ __all__ = [
     "proj",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterize_contributing_gaussian_ids",
+    "rasterize_num_contributing_gaussians",
+    "rasterize_to_indices_in_range",
     "rasterize_to_pixels",
+    "rasterize_top_contributing_gaussian_ids",
     "skipping_bad_gaussians",
     "spherical_harmonics",
     "spherical_harmonics_l0",
@@ -158,7 +170,8 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     if a.sparse_grad:
         shapes = {name: getattr(a, name) for name in ("means", "quats", "scales", "covars")}
         used = {name: tensor for name, tensor in shapes.items() if tensor is not None}
-        a = replace(a, **{name: with_sparse_gradient(tensor, touched) for name, tensor in used.items()})
+        sparse: Any = {name: with_sparse_gradient(tensor, touched) for name, tensor in used.items()}
+        a = replace(a, **sparse)
     lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)

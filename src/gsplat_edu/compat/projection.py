@@ -269,9 +269,8 @@ def fully_fused_projection(
 
     Returns:
         radii (int32), means2d, depths, conics and compensations, of shape (..., C, N, ...); packed: batch_ids,
-        camera_ids and gaussian_ids (int64), indptr, then the same of the Gaussians with positive radii only. The rows
-        of image i, batch times C plus camera, are indptr[i] to indptr[i + 1]: int32 (images + 1). gsplat 1.5.3 has no
-        indptr. Compensations are None unless asked for.
+        camera_ids and gaussian_ids (int64), indptr, then the same of the Gaussians with positive radii only. Rows
+        indptr[i] to indptr[i + 1] (int32) are of image i, batch times C plus camera. Compensations may be None.
 
     Raises:
         ShapeError: a shape differs.
@@ -306,8 +305,14 @@ def fully_fused_projection(
     results = [*found[:4], found.compensations if calc_compensations else None]
     if not packed:
         return tuple(None if each is None else each.view(*batch, C, N, *each.shape[3:]) for each in results)
-    drawn = (found.radii > 0).all(dim=-1)
-    ids = drawn.nonzero().unbind(-1)
-    touched.append(ids[2].bincount().nonzero()[:, 0])
+    return _packed(results, touched)
+
+
+def _packed(results: list[Tensor | None], touched: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """Return ids, indptr and the drawn rows of the results, of which the first are radii; say which rows they are."""
+    assert results[0] is not None
+    drawn = (results[0] > 0).all(dim=-1)
+    touched.append(drawn.any(dim=(0, 1)).nonzero()[:, 0])
     indptr = torch.nn.functional.pad(drawn.sum(dim=-1).flatten().cumsum(0), (1, 0)).int()
-    return (*ids, indptr, *(None if each is None else each[drawn] for each in results))
+    rows = (None if each is None else each[drawn] for each in results)
+    return (*drawn.nonzero().unbind(-1), indptr, *rows)

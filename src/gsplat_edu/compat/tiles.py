@@ -73,21 +73,13 @@ def isect_tiles(
     """
     real_tensor("means2d", means2d)
     flag("sort", sort), flag("segmented", segmented)
-    leading = tuple(means2d.shape[:-1])
-    expect("means2d", means2d, (*leading, 2), means2d)
-    for name, tensor, shape in (("radii", radii, (*leading, 2)), ("depths", depths, leading)):
-        check_tensor(name, tensor, ("...",), {})
-        if tuple(tensor.shape) != shape:
-            raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
+    leading = _check_splats(means2d, radii, depths, conics, opacities)
     sizes = {"tile_size": tile_size, "tile_width": tile_width, "tile_height": tile_height}
     for name, size in sizes.items():
         whole_number(name, size, 1, MOST_PIXELS)
     images, count = _images(leading, flag("packed", packed), n_images, image_ids, gaussian_ids)
     bits = _tile_bits(tile_width, tile_height, count)
     centres, halves = means2d.reshape(-1, 2), radii.reshape(-1, 2)
-    for name, given, tail in (("conics", conics, (3,)), ("opacities", opacities, ())):
-        if given is not None:
-            expect(name, given, (*leading, *tail), means2d, "means2d")
     if conics is None or opacities is None:
         tiles, rows, places = _boxes(centres, halves, sizes)
     else:
@@ -99,6 +91,22 @@ def isect_tiles(
         ids, order = torch.sort(ids, stable=True)
         rows = rows[order]
     return tiles.view(leading).int(), ids, rows.int()
+
+
+def _check_splats(
+    means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor | None, opacities: Tensor | None
+) -> tuple[int, ...]:
+    """Check the tensors of `isect_tiles`; return their leading axes."""
+    leading = tuple(means2d.shape[:-1])
+    expect("means2d", means2d, (*leading, 2), means2d)
+    for name, tensor, shape in (("radii", radii, (*leading, 2)), ("depths", depths, leading)):
+        check_tensor(name, tensor, ("...",), {})
+        if tuple(tensor.shape) != shape:
+            raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
+    for name, given, tail in (("conics", conics, (3,)), ("opacities", opacities, ())):
+        if given is not None:
+            expect(name, given, (*leading, *tail), means2d, "means2d")
+    return leading
 
 
 def _boxes(means2d: Tensor, radii: Tensor, sizes: dict[str, int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -262,10 +270,10 @@ def rasterize_to_pixels(
 
     Differentiable in: means2d, conics, colors, opacities, backgrounds.
     """
-    return _composited(_Tiles(**_checked(**locals())))
+    return _composited(Tiles(**checked_lists("isect_offsets", **locals())))
 
 
-class _Tiles(NamedTuple):
+class Tiles(NamedTuple):
     """Checked arguments of `rasterize_to_pixels`."""
 
     means2d: Tensor
@@ -283,7 +291,7 @@ class _Tiles(NamedTuple):
     absgrad: bool
 
 
-def _composited(a: _Tiles) -> tuple[Tensor, Tensor]:
+def _composited(a: Tiles) -> tuple[Tensor, Tensor]:
     """Composite tile after tile, and join them."""
     starts, rows, D = a.isect_offsets.flatten().tolist(), a.flatten_ids, a.colors.shape[-1]
     rows_of_tiles, tiles_x = a.isect_offsets.shape[-2:]
@@ -336,8 +344,8 @@ def _covariances(conics: Tensor, rows: Tensor) -> Tensor:
     return torch.stack(parts, dim=-1)
 
 
-def _checked(**a: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Check the arguments of `rasterize_to_pixels`; return them with int64 lists."""
+def checked_lists(named: str, **a: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Check the arguments of `rasterize_to_pixels`, with `named` for the offsets; return them with int64 lists."""
     means2d, packed = real_tensor("means2d", a["means2d"]), flag("packed", a["packed"])
     flag("absgrad", a["absgrad"])
     check_size(a["image_width"], a["image_height"], "image_width", "image_height")
@@ -348,23 +356,22 @@ def _checked(**a: Any) -> dict[str, Any]:  # noqa: ANN401
     D = a["colors"].shape[-1] if a["colors"].ndim else 0
     for name, tail in (("conics", (3,)), ("colors", (max(D, 1),)), ("opacities", ())):
         expect(name, a[name], (*leading, *tail), means2d, "means2d")
-    offsets, rows = (whole_numbers(name, a[name]) for name in ("isect_offsets", "flatten_ids"))
+    offsets, rows = (
+        whole_numbers(name, a[key])
+        for name, key in ((named, "isect_offsets"), ("flatten_ids", "flatten_ids"))
+    )
     images = tuple(offsets.shape[:-2]) if packed else leading[:-1]
     if offsets.ndim < 2 or tuple(offsets.shape[:-2]) != images:
         raise ShapeError(
-            f"isect_offsets: has shape {tuple(offsets.shape)}, but has to be {(*images, 'rows', 'columns')}"
+            f"{named}: has shape {tuple(offsets.shape)}, but has to be {(*images, 'rows', 'columns')}"
         )
     if offsets.shape[-2] * edge < a["image_height"] or offsets.shape[-1] * edge < a["image_width"]:
-        raise ShapeError(
-            f"isect_offsets: has {tuple(offsets.shape[-2:])} tiles, which do not cover the image"
-        )
+        raise ShapeError(f"{named}: has {tuple(offsets.shape[-2:])} tiles, which do not cover the image")
     if rows.ndim != 1 or ids_outside(rows, math.prod(leading)):
         raise ArgumentError(f"flatten_ids: has to hold rows of the inputs, 0 to {math.prod(leading) - 1}")
     flat = offsets.flatten()
     if bool((flat.diff() < 0).any()) or ids_outside(flat, len(rows) + 1) or (len(flat) and int(flat[0])):
-        raise ArgumentError(
-            f"isect_offsets: has to grow from 0 to at most {len(rows)}, the length of flatten_ids"
-        )
+        raise ArgumentError(f"{named}: has to grow from 0 to at most {len(rows)}, the length of flatten_ids")
     if a["backgrounds"] is not None:
         expect("backgrounds", a["backgrounds"], (*images, D), means2d, "means2d")
     masks = a["masks"]
