@@ -43,7 +43,7 @@ ADDED = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
-"""Arguments that gsplat's main branch has added, with their defaults."""
+"""Arguments that gsplat 1.6.0 has added, with their defaults."""
 
 
 def test_added_arguments_have_gsplats_defaults():

@@ -18,7 +18,7 @@ CLOSE = {"rtol": 1e-10, "atol": 1e-10}
 
 @pytest.mark.parametrize("name", ["rasterization", "fully_fused_projection"])
 def test_the_signatures_are_gsplats(name):
-    """Positions, names and defaults agree; arguments that gsplat's main branch has added are keyword-only."""
+    """Positions, names and defaults agree; arguments that gsplat 1.6.0 has added are keyword-only."""
 
     def bare(function):
         return [

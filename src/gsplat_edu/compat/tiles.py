@@ -79,12 +79,7 @@ def isect_tiles(
         whole_number(name, size, 1, MOST_PIXELS)
     images, count = _images(leading, flag("packed", packed), n_images, image_ids, gaussian_ids)
     bits = _tile_bits(tile_width, tile_height, count)
-    centres, halves = means2d.reshape(-1, 2), radii.reshape(-1, 2)
-    if conics is None or opacities is None:
-        tiles, rows, places = _boxes(centres, halves, sizes)
-    else:
-        ellipses = _Ellipses(centres.double(), conics.reshape(-1, 3).double(), _levels(opacities.reshape(-1)))
-        tiles, rows, places = _met_by(ellipses, (halves > 0).all(dim=-1), sizes)
+    tiles, rows, places = _pairs(means2d.reshape(-1, 2), radii.reshape(-1, 2), conics, opacities, sizes)
     deep = depths.reshape(-1).float().view(torch.int32).long() & (2**DEPTH_BITS - 1)
     ids = ((images[rows] << bits | places) << DEPTH_BITS) | deep[rows]
     if sort:
@@ -122,6 +117,16 @@ def _boxes(means2d: Tensor, radii: Tensor, sizes: dict[str, int]) -> tuple[Tenso
     columns = spans[rows, 0]
     x, y = low[rows, 0] + place % columns, low[rows, 1] + place // columns
     return tiles, rows, y * sizes["tile_width"] + x
+
+
+def _pairs(
+    centres: Tensor, halves: Tensor, conics: Tensor | None, opacities: Tensor | None, sizes: dict[str, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pairs by ellipses if there are conics and opacities, else by boxes; see `_boxes`."""
+    if conics is None or opacities is None:
+        return _boxes(centres, halves, sizes)
+    ellipses = _Ellipses(centres.double(), conics.reshape(-1, 3).double(), _levels(opacities.reshape(-1)))
+    return _met_by(ellipses, (halves > 0).all(dim=-1), sizes)
 
 
 class _Ellipses(NamedTuple):
