@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from gsplat_edu.base.constants import ALPHA_MIN, DET_FLOOR, THINNEST
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.validation import flag
 from gsplat_edu.compat.checks import (
     check_camera_model,
@@ -42,7 +43,7 @@ TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
 
 def with_sparse_gradient(tensor: Tensor, rows: list[Tensor]) -> Tensor:
-    """Return the tensor, whose gradient will be a coalesced sparse COO tensor.
+    """Return the tensor, whose gradient will be a sparse COO tensor that holds each row once.
 
     Args:
         tensor: Any tensor.
@@ -52,6 +53,7 @@ def with_sparse_gradient(tensor: Tensor, rows: list[Tensor]) -> Tensor:
     return found
 
 
+@first_derivative_only("sparse_grad=True", "sparse_grad=False")
 class _SparseRows(torch.autograd.Function):
     """The identity with a sparse gradient."""
 
