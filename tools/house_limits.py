@@ -28,6 +28,13 @@ EXCEPTIONS = {
         "the chapter's seven parameters stay as they are; four more make it the kernels' oracle"
     ),
     "src/gsplat_edu/compat/gsplat.py:rasterization": "gsplat's signature",
+    "src/gsplat_edu/compat/contributors.py:accumulate": "gsplat's signature",
+    "src/gsplat_edu/compat/contributors.py:rasterize_contributing_gaussian_ids": "gsplat's signature",
+    "src/gsplat_edu/compat/contributors.py:rasterize_to_indices_in_range": "gsplat's signature",
+    "src/gsplat_edu/compat/contributors.py:rasterize_top_contributing_gaussian_ids": "gsplat's signature",
+    "src/gsplat_edu/compat/harmonics.py:_from_cameras": "gsplat's signature",
+    "src/gsplat_edu/compat/harmonics.py:spherical_harmonics": "gsplat's signature",
+    "src/gsplat_edu/compat/harmonics.py:spherical_harmonics_l1_plus": "gsplat's signature",
     "src/gsplat_edu/compat/tiles.py:isect_tiles": "gsplat's signature",
     "src/gsplat_edu/compat/tiles.py:rasterize_to_pixels": "gsplat's signature",
     "src/gsplat_edu/compat/projection.py:fully_fused_projection": "gsplat's signature",

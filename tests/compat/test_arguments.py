@@ -13,7 +13,6 @@ from gsplat_edu.compat.gsplat import RollingShutterType, fully_fused_projection,
 pytestmark = pytest.mark.usefixtures("as_shipped")
 
 UNSUPPORTED = {
-    "sparse_grad": True,
     "distributed": True,
     "with_eval3d": True,
     "ftheta_coeffs": object(),
@@ -44,7 +43,7 @@ ADDED = {
     "extra_signals_sh_degree": None,
     "renderer_config": None,
 }
-"""Arguments that gsplat's main branch has added, with their defaults."""
+"""Arguments that gsplat 1.6.0 has added, with their defaults."""
 
 
 def test_added_arguments_have_gsplats_defaults():

@@ -112,7 +112,7 @@ def test_projection(fused, compensated):
     inputs = (*inputs, tensors["viewmats"], tensors["Ks"])
     assert_same_gradients(inputs, *zip(*pairs, strict=True), {len(inputs) - 1: skew})
     packed = compat.fully_fused_projection(*given, *cameras, packed=True, calc_compensations=compensated)
-    for mine, whole in zip(packed[3:], found, strict=True):
+    for mine, whole in zip(packed[4:], found, strict=True):
         assert whole is None or torch.equal(mine, whole[packed[1], packed[2]])
 
 
@@ -235,9 +235,9 @@ def test_rasterization_takes_degree_4():
     assert_close(images, gsplat_witness.rendered(tensors, W, H, 4)[0])
 
 
-def relocated(o, n):
-    """Evaluate equation 9 of the MCMC paper term by term."""
-    new = 1 - (1 - o) ** (1 / n)
+def relocated(o, n, least):
+    """Evaluate equation 9 of the MCMC paper term by term, after gsplat 1.6.0's clamp of the new opacity."""
+    new = min(max(1 - (1 - o) ** (1 / n), least), 1 - 2**-23)
     total = sum(
         math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
         for i in range(1, n + 1)
@@ -246,19 +246,27 @@ def relocated(o, n):
     return new, o / total
 
 
-def test_relocation():
-    """Terms of the sum cancel. The largest is below 300 times the sum, so rounding is below 300 * 2^-53 < 1e-12."""
+@pytest.mark.parametrize("least", [0.0, 0.005, 0.05])
+def test_relocation(least):
+    """Terms of the sum cancel. The largest is below 300 times the sum, so rounding is below 300 * 2^-53 < 1e-12.
+
+    The clamp of opacity 1 leaves n = 1 only: the terms of n = 51 would be 1e14 times the sum.
+    """
     binoms = torch.tensor(
         [[float(math.comb(n, k)) for k in range(51)] for n in range(51)], dtype=torch.float64
     )
-    cases = [(o, n) for o in (0.01, 0.3, 0.9) for n in (1, 2, 7, 51)]
+    cases = [(o, n) for o in (0.01, 0.3, 0.9) for n in (1, 2, 7, 51)] + [(1.0, 1)]
     opacities = torch.tensor([o for o, _ in cases], dtype=torch.float64)
     scales, ratios = torch.rand(len(cases), 3, dtype=torch.float64), torch.tensor([n for _, n in cases])
-    found, moved = compat.compute_relocation(opacities, scales, ratios, binoms)
+    found, moved = compat.compute_relocation(opacities, scales, ratios, binoms, min_opacity=least)
     for k, (o, n) in enumerate(cases):
-        new, factor = relocated(o, n)
+        new, factor = relocated(o, n, least)
         assert abs(float(found[k]) - new) < 1e-12
         assert_close(moved[k], scales[k] * factor, 1e-11)
+    if least == 0.005:
+        assert torch.equal(compat.compute_relocation(opacities, scales, ratios, binoms)[1], moved)
+    with pytest.raises(ArgumentError, match="^min_opacity: "):
+        compat.compute_relocation(opacities, scales, ratios, binoms, min_opacity=1.5)
     clamped = compat.compute_relocation(opacities, scales, ratios * 0 + 1000, binoms)
     assert_close(clamped[0], compat.compute_relocation(opacities, scales, ratios * 0 + 51, binoms)[0])
     assert int(ratios.max()) == 51

@@ -328,16 +328,20 @@ def test_absgrad_of_an_empty_view_is_zero():
     assert torch.equal(meta["means2d"].absgrad, torch.zeros(2, 3, 2, dtype=torch.float64))
 
 
-def test_absgrad_adds_up_as_grad_does():
+def test_absgrad_is_assigned_by_each_backward_pass():
+    """As in gsplat, the attribute exists before, and unlike `.grad` it does not add up."""
     images, _, meta = render(gsplat_witness.scene(), sh_degree=0, absgrad=True)
     meta["means2d"].retain_grad()
+    kept = meta["means2d"].absgrad
+    assert torch.equal(kept, torch.zeros_like(meta["means2d"]))
     found = []
     for _ in range(2):
         images.square().sum().backward(retain_graph=True)
-        found.append((meta["means2d"].grad.clone(), meta["means2d"].absgrad.clone()))
-    for once, twice in zip(*found, strict=True):
-        assert float(once.abs().max()) > 0
-        assert_close(twice, 2 * once)
+        found.append((meta["means2d"].grad.clone(), kept.clone()))
+    (once, absolute), (twice, again) = found
+    assert float(once.abs().max()) > 0 and float(absolute.max()) > 0
+    assert_close(twice, 2 * once)
+    assert torch.equal(absolute, again) and meta["means2d"].absgrad is kept
 
 
 def test_no_reference_keeps_an_image_alive():

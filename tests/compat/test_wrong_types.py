@@ -38,6 +38,16 @@ WRONG = {
 
 GIVEN = arguments()
 PROJECTION = ("means", "quats", "scales", "viewmats", "Ks", "width", "height")
+SEEN = {
+    "degrees_to_use": 1,
+    "means": torch.ones(6, 3),
+    "viewmats": GIVEN["viewmats"],
+    "masks": torch.ones(5, dtype=torch.bool),
+    "batch_ids": torch.zeros(5, dtype=torch.int64),
+    "camera_ids": torch.ones(5, dtype=torch.int64),
+    "gaussian_ids": torch.arange(5),
+    "viewmats_rs": GIVEN["viewmats"],
+}
 CALLS = {
     "render": (
         render,
@@ -59,6 +69,12 @@ CALLS = {
     "spherical_harmonics": (
         compat.spherical_harmonics,
         {"degrees_to_use": 1, "dirs": torch.ones(6, 3), "coeffs": torch.ones(6, 4, 3)},
+    ),
+    "spherical_harmonics of cameras": (compat.spherical_harmonics, SEEN | {"coeffs": torch.ones(5, 4, 3)}),
+    "spherical_harmonics_l0": (compat.spherical_harmonics_l0, {"sh0": torch.ones(6, 1, 3)}),
+    "spherical_harmonics_l1_plus": (
+        compat.spherical_harmonics_l1_plus,
+        SEEN | {"shN": torch.ones(5, 3, 3)},
     ),
     "quat_scale_to_covar_preci": (
         compat.quat_scale_to_covar_preci,
@@ -122,7 +138,9 @@ CALLS = {
     ),
 }
 CASES = [
-    (function, name) for function, (call, _) in CALLS.items() for name in inspect.signature(call).parameters
+    (function, name)
+    for function, (call, given) in CALLS.items()
+    for name in (given if "harmonics" in function else inspect.signature(call).parameters)
 ]
 TAKEN = {
     # A number of any size is a limit, and a list of cameras has no length limit.

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsplat_edu.base.constants import DILATION_MAX, SPLAT_LIMIT
+from gsplat_edu.base.constants import DILATION_MAX, SPLAT_LIMIT, TILE
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import flag, in_range, one_of, quoted, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES
@@ -35,6 +35,9 @@ MOST_PIXELS = 2**31 - 1
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 """Values of `render_mode`."""
 
+HIT_DISTANCES = ("d", "Ed", "RGB-d", "RGB-Ed")
+"""Render modes of gsplat 1.6.0 that need `with_eval3d`."""
+
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 """Values of `camera_model`."""
 
@@ -42,7 +45,6 @@ RADIAL = {"pinhole": 6, "fisheye": 4}
 """Number of radial coefficients of those that may be distorted."""
 
 ONLY_VALUES = {
-    "sparse_grad": False,
     "distributed": False,
     "with_eval3d": False,
     "return_normals": False,
@@ -57,7 +59,6 @@ ONLY_VALUES = {
 """Arguments that `rasterization` has with one value only."""
 
 REMEDIES = {
-    "sparse_grad": "gradients are dense",
     "distributed": "render on one machine",
     "return_normals": "gsplat_edu.render.maps.render_maps renders normals",
     "global_z_order": "Gaussians are sorted by camera depth",
@@ -97,7 +98,8 @@ class Arguments:
         scales: (..., N, 3) standard deviations, world units. Ignored with `covars`.
         opacities: (..., N) 0 to 1.
         colors: (..., N, D) or (..., C, N, D) numbers to composite; with `sh_degree` (..., N, K, 3) or (..., C, N, K, 3)
-            coefficients. None is allowed if `render_mode` is D or ED.
+            coefficients of any D instead of 3, or (N, K, D), shared by all scenes; float16 coefficients are allowed
+            beside float32. None is allowed if `render_mode` is D or ED.
         viewmats: (..., C, 4, 4) world to camera, OpenCV axes.
         Ks: (..., C, 3, 3) intrinsics, px; the centre of the first pixel is at (0.5, 0.5).
         width: Width of the images, px.
@@ -109,12 +111,13 @@ class Arguments:
         sh_degree: Highest degree of the harmonics to use, 0 to 4; None if `colors` are not coefficients.
         packed: Whether `meta` lists the drawn Gaussians only, (nnz, ...), instead of all, (..., C, N, ...). The images
             and the work are the same.
-        tile_size: Only sets tile_width and tile_height in `meta`; the kernels have tiles of 16 px.
+        tile_size: Only sets tile_width and tile_height in `meta`; the kernels have tiles of 16 px. None is 16.
         backgrounds: (..., C, D) colours behind everything; None for 0. With `extra_signals` (..., C, D + E), or
             (..., C, E) for D and ED, which ignore `backgrounds` otherwise.
         render_mode: Which channels to return: RGB, D, ED, RGB+D, RGB+ED.
-        sparse_grad: False.
-        absgrad: Whether the backward pass sets `meta["means2d"].absgrad`.
+        sparse_grad: Whether means, quats, scales and covars get sparse COO gradients, with a row for each drawn
+            Gaussian. Needs `packed`, and tensors without leading axes.
+        absgrad: Whether each backward pass assigns `meta["means2d"].absgrad`, which holds zeros before.
         rasterize_mode: "classic", or "antialiased": opacities times sqrt(det0 / det).
         channel_chunk: No effect: any number of channels is composited, 32 beside the first three at a time.
         distributed: False.
@@ -163,7 +166,7 @@ class Arguments:
     eps2d: float
     sh_degree: int | None
     packed: bool
-    tile_size: int
+    tile_size: int | None
     backgrounds: Tensor | None
     render_mode: str
     sparse_grad: bool
@@ -199,16 +202,24 @@ class Arguments:
         """Check every argument."""
         for name, only in ONLY_VALUES.items():
             _check_only(name, getattr(self, name), only)
+        if str(self.render_mode) in HIT_DISTANCES:
+            raise ArgumentError(
+                f"render_mode: is {self.render_mode!r}, a distance along rays, "
+                "which needs with_eval3d; render 'D' or 'ED'"
+            )
         one_of("render_mode", self.render_mode, RENDER_MODES)
         one_of("rasterize_mode", self.rasterize_mode, ("classic", "antialiased"))
-        for name in ("packed", "absgrad", "segmented", "with_ut"):
+        for name in ("packed", "absgrad", "sparse_grad", "segmented", "with_ut"):
             flag(name, getattr(self, name))
         check_size(self.width, self.height)
+        if self.tile_size is None:
+            object.__setattr__(self, "tile_size", TILE)
         for name in ("tile_size", "channel_chunk"):
             whole_number(name, getattr(self, name), 1)
         check_limits(self.near_plane, self.far_plane, self.radius_clip, self.eps2d)
         named = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
         batch, N = check_scene(named, self.covars is not None)
+        check_sparse(self.sparse_grad, self.packed, batch)
         if self.covars is not None:
             expect("covars", self.covars, (*batch, N, 3, 3), self.means)
         C = check_cameras(self.viewmats, self.Ks, batch, self.means)
@@ -263,7 +274,7 @@ class Arguments:
                     "sh_degree: is given, but colors is None; give coefficients, or no degree"
                 )
             return 0
-        return self._check_channels("colors", self.colors, self.sh_degree, self.colors_per_camera, 3)
+        return self._check_channels("colors", self.colors, self.sh_degree, self.colors_per_camera)
 
     def _check_extra_signals(self) -> int:
         """Check further channels; return their number."""
@@ -274,14 +285,12 @@ class Arguments:
                     "extra_signals_sh_degree: is given, but extra_signals is None; give coefficients, or no degree"
                 )
             return 0
-        channels = self._check_channels("extra_signals", signals, degree, self.extra_signals_per_camera, None)
+        channels = self._check_channels("extra_signals", signals, degree, self.extra_signals_per_camera)
         if channels == 0:
             raise ShapeError(f"extra_signals: has shape {tuple(signals.shape)}, but has to have a channel")
         return channels
 
-    def _check_channels(
-        self, name: str, tensor: Tensor, degree: int | None, per_camera: bool, of_harmonics: int | None
-    ) -> int:
+    def _check_channels(self, name: str, tensor: Tensor, degree: int | None, per_camera: bool) -> int:
         """Check channels of Gaussians, or coefficients of them; return the number of channels.
 
         Args:
@@ -289,7 +298,6 @@ class Arguments:
             tensor: Its value.
             degree: Highest degree of the harmonics; None for channels.
             per_camera: Whether it has an axis of cameras.
-            of_harmonics: Channels that coefficients have; None for any, and for coefficients without leading axes.
         """
         check_tensor(name, tensor, ("...",), {})
         channels = tensor.shape[-1] if tensor.ndim else 0
@@ -297,8 +305,10 @@ class Arguments:
         tail: tuple[int, ...] = (channels,)
         if degree is not None:
             most = (whole_number(DEGREES[name], degree, 0, MOST_DEGREE) + 1) ** 2
-            channels = channels if of_harmonics is None else of_harmonics
-            lead, tail = () if of_harmonics is None else lead, (max(most, *tensor.shape[-2:-1]), channels)
+            lead = () if name == "extra_signals" or tensor.ndim == 3 else lead
+            tail = (max(most, *tensor.shape[-2:-1]), channels)
+            if tensor.dtype == torch.float16:
+                tensor = tensor.to(self.means.dtype)
         expect(name, tensor, (*lead, self.N, *tail), self.means)
         return channels
 
@@ -352,10 +362,10 @@ def check_limits(near_plane: float, far_plane: float, radius_clip: float, eps2d:
     in_range("eps2d", eps2d, 0.0, DILATION_MAX)
 
 
-def check_projection_options(sparse_grad: bool, camera_model: str) -> None:
-    """Check the arguments of `fully_fused_projection` of which not all values are supported."""
-    _check_only("sparse_grad", sparse_grad, False)
-    check_camera_model(camera_model)
+def check_sparse(sparse_grad: bool, packed: bool, batch: tuple[int, ...]) -> None:
+    """Check that sparse gradients are possible."""
+    if sparse_grad and (not packed or batch):
+        raise ArgumentError("sparse_grad: is True, which needs packed=True and tensors without leading axes")
 
 
 def check_camera_model(value: object) -> None:
@@ -373,7 +383,7 @@ def check_scene(named: Mapping[str, Tensor | None], from_covars: bool) -> tuple[
     batch, N = tuple(means.shape[:-2]), means.shape[-2] if means.ndim >= 2 else 0
     expect("means", means, (*batch, N, 3), means)
     for name, tail in (("quats", (4,)), ("scales", (3,)), ("opacities", ())):
-        tensor = named[name]
+        tensor = named.get(name)
         if from_covars and name in ("quats", "scales"):
             continue
         if tensor is None:

@@ -41,6 +41,8 @@ def colors_of(a: Arguments, colors: Tensor, drawn: Drawn) -> Float[Tensor, "nnz 
     row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
     if a.sh_degree is None:
         return joined(colors, colors.ndim - 1).index_select(0, row)
+    if colors.ndim == 3:
+        row = drawn.gaussians  # shared by all scenes
     values = evaluate(a.sh_degree, directions(a, drawn), joined(colors, colors.ndim - 2), (row, drawn.ends))
     return torch.clamp_min(values + SH_OFFSET, 0.0)
 

@@ -1,7 +1,7 @@
-"""A drop-in for gsplat 1.5.3: `rasterization`, `rasterization_2dgs` and the steps they are made of, on any CPU.
+"""A drop-in for gsplat 1.6.0 and 1.5.3: `rasterization`, `rasterization_2dgs` and their steps, on any CPU.
 
-`rasterization` also has the nine arguments that gsplat's main branch has added since. There they stand between those of
-1.5.3; here they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
+`rasterization` also has the nine arguments that gsplat 1.6.0 has added. There they stand between those of 1.5.3; here
+they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
 
     from gsplat_edu.compat.gsplat import rasterization      # instead of: from gsplat import rasterization
 
@@ -15,8 +15,8 @@ So the stages here are the same. Projection and harmonics are native steps of th
 for lenses, degree 4 and other than three channels; `meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are
 nodes of the graph between them and the image. Compositing is our native kernels (images.py), whose gradient with
 respect to a mean on the screen arrives at `meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad,
-hooks and losses on these tensors work without special cases. `absgrad` is a statistic that the kernels collect; a hook
-on their input stores it as an attribute after each backward pass.
+hooks and losses on these tensors work without special cases. `absgrad` is a statistic that the kernels collect; hooks
+on their inputs add it up, and a hook on the centres assigns the sums to the attribute at the end of each backward pass.
 
 The renderer's own projection is not used: it returns no centres that a graph could pass through. Compositing projects
 what is on the screen once more, which `gsplat_edu.render.api.render` need not do.
@@ -25,6 +25,7 @@ what is on the screen once more, which `gsplat_edu.render.api.render` need not d
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -34,12 +35,31 @@ from torch import Tensor
 from gsplat_edu.base.constants import SH_OFFSET
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
+from gsplat_edu.compat.contributors import (
+    accumulate,
+    rasterize_contributing_gaussian_ids,
+    rasterize_num_contributing_gaussians,
+    rasterize_to_indices_in_range,
+    rasterize_top_contributing_gaussian_ids,
+)
 from gsplat_edu.compat.drawn import Drawn, colors_of, directions, drawn_at, joined
-from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
-from gsplat_edu.compat.images import Splats, absgrad_store, composite
+from gsplat_edu.compat.harmonics import (
+    evaluate,
+    spherical_harmonics,
+    spherical_harmonics_l0,
+    spherical_harmonics_l1_plus,
+)
+from gsplat_edu.compat.images import Absgrad, Splats, composite
 from gsplat_edu.compat.lenses import cameras_of
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
-from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
+from gsplat_edu.compat.projection import (
+    TRIANGLE,
+    Lens,
+    fully_fused_projection,
+    project,
+    solids_of,
+    with_sparse_gradient,
+)
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
 from gsplat_edu.compat.surfel_images import rasterize_to_pixels_2dgs
 from gsplat_edu.compat.surfels import fully_fused_projection_2dgs, rasterization_2dgs
@@ -48,6 +68,7 @@ from gsplat_edu.render.api import BYTES_PER_PIXEL
 
 __all__ = [
     "RollingShutterType",
+    "accumulate",
     "compute_relocation",
     "fully_fused_projection",
     "fully_fused_projection_2dgs",
@@ -57,10 +78,16 @@ __all__ = [
     "quat_scale_to_covar_preci",
     "rasterization",
     "rasterization_2dgs",
+    "rasterize_contributing_gaussian_ids",
+    "rasterize_num_contributing_gaussians",
+    "rasterize_to_indices_in_range",
     "rasterize_to_pixels",
     "rasterize_to_pixels_2dgs",
+    "rasterize_top_contributing_gaussian_ids",
     "skipping_bad_gaussians",
     "spherical_harmonics",
+    "spherical_harmonics_l0",
+    "spherical_harmonics_l1_plus",
     "world_to_cam",
 ]
 
@@ -84,7 +111,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = 16,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -136,6 +163,12 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
         BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
         "render fewer images, or fewer pixels (width, height)",
     )
+    touched: list[Tensor] = []
+    if a.sparse_grad:
+        shapes = {name: getattr(a, name) for name in ("means", "quats", "scales", "covars")}
+        used = {name: tensor for name, tensor in shapes.items() if tensor is not None}
+        sparse: Any = {name: with_sparse_gradient(tensor, touched) for name, tensor in used.items()}
+        a = replace(a, **sparse)
     lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)
@@ -146,6 +179,8 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     spreads = joined(found.spreads, 3).index_select(0, positions)
     check_spreads("scales" if a.covars is None else "covars", spreads, positions, (a.batch, a.C, a.N))
     drawn = drawn_at(positions, a)
+    if a.sparse_grad:
+        touched.append(drawn.gaussians.bincount().nonzero()[:, 0])
     opacities = flat[:, None].expand(-1, a.C, -1)
     if antialiased:
         opacities = opacities * found.compensations
@@ -165,7 +200,7 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
     meta |= {"n_batches": a.batches, "n_cameras": a.C}
     for name, size in (("tile_width", a.width), ("tile_height", a.height)):
-        meta[name] = math.ceil(size / a.tile_size)
+        meta[name] = math.ceil(size / meta["tile_size"])
     views = _draw(a, lens, drawn, spreads, meta)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
     alphas = 1.0 - transmittance[..., None]
@@ -187,7 +222,8 @@ def _draw(
     meta: dict[str, Any],
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Draw every image, given the spreads of the drawn Gaussians."""
-    own = [meta[name] for name in ("means2d", "depths", "opacities")]
+    kept = Absgrad(meta["means2d"]) if a.absgrad else None
+    own = [meta["means2d"] if kept is None else kept.means2d, meta["depths"], meta["opacities"]]
     rows = torch.arange(len(spreads)) if a.packed else drawn.positions  # in the tensors of `meta`
     if not a.packed:
         own = [joined(each, len(a.batch) + 2).index_select(0, rows) for each in own]
@@ -211,8 +247,7 @@ def _draw(
             None if signals is None else signals[part],
             order=depths.detach()[part] + 0.0,  # not -0
         )
-        store = absgrad_store(meta["means2d"], rows[part]) if a.absgrad else None
-        image, transmittance = composite(splats, lens, store)
+        image, transmittance = composite(splats, lens, None if kept is None else kept.adder(rows[part]))
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances

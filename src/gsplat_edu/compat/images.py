@@ -21,8 +21,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.constants import COLOR_LIMIT
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.compat.projection import Lens
+from gsplat_edu.compat.screen import INSTEAD, Lens
 from gsplat_edu.render.cpu.render import render_on_screen
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
@@ -114,6 +115,7 @@ def _render(
     return view
 
 
+@first_derivative_only("gsplat's rasterization", INSTEAD)
 class _Raised(torch.autograd.Function):
     """Means and covariances in space from those on the screen; autograd would take ten steps."""
 
@@ -131,12 +133,34 @@ class _Raised(torch.autograd.Function):
         return means[:, :2].contiguous(), spreads
 
 
-def absgrad_store(means2d: Tensor, rows: Int64[Tensor, " M"]) -> Callable[[Tensor, Tensor], None]:
-    """Return a function that adds sums of absolute gradients to `means2d.absgrad`, given indices into `rows`."""
+class Absgrad:
+    """Sums of absolute gradients, kept at `means2d.absgrad` as gsplat keeps them.
 
-    def store(visible: Tensor, sums: Tensor) -> None:
-        if not hasattr(means2d, "absgrad"):
-            means2d.absgrad = torch.zeros_like(means2d)  # type: ignore[attr-defined]
-        means2d.absgrad.view(-1, 2).index_add_(0, rows[visible], sums)  # type: ignore[attr-defined]
+    The attribute exists before the backward pass, filled with zeros. Each backward pass assigns its own sums.
 
-    return store
+    Args:
+        means2d: (..., 2) centres, px; the attribute is added to this tensor.
+    """
+
+    def __init__(self, means2d: Tensor) -> None:
+        kept, sums = torch.zeros_like(means2d), torch.zeros_like(means2d).view(-1, 2)
+        means2d.absgrad = kept  # type: ignore[attr-defined]
+        self.means2d = means2d.view_as(means2d)
+        """The centres to draw with. Their gradient is complete once every image has added its sums."""
+        self._sums = sums
+
+        def publish(_: Tensor) -> None:
+            kept.view(-1, 2).copy_(sums)
+            sums.zero_()
+
+        if means2d.requires_grad:
+            self.means2d.register_hook(publish)  # type: ignore[no-untyped-call]
+
+    def adder(self, rows: Int64[Tensor, " M"]) -> Callable[[Int64[Tensor, " V"], Tensor], None]:
+        """Return a function that adds sums, given indices into `rows`, which hold no row twice."""
+        sums = self._sums
+
+        def add(visible: Tensor, found: Tensor) -> None:
+            sums.index_add_(0, rows[visible], found)
+
+        return add

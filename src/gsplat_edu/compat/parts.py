@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.validation import first_index, flag
-from gsplat_edu.compat.checks import check_projection_options, check_size, expect, real_tensor
+from gsplat_edu.base.validation import first_index, flag, in_range
+from gsplat_edu.compat.checks import check_camera_model, check_size, expect, real_tensor
 from gsplat_edu.compat.projection import MARGIN, TRIANGLE
 from gsplat_edu.render.torch.sight import TORCH
 from gsplat_edu.scene.gaussians import check_tensor, quat_to_R_t
 from gsplat_edu.scene.projection_formulas import OnPlane, fisheye, orthographic
+
+OPACITY_LIMIT = 1.0 - 2.0**-23
+"""Largest opacity that `compute_relocation` returns."""
 
 
 def quat_scale_to_covar_preci(
@@ -114,7 +117,7 @@ def proj(
     Differentiable in: means, covars, Ks.
     """
     real_tensor("means", means)
-    check_projection_options(False, camera_model)
+    check_camera_model(camera_model)
     check_size(width, height)
     batch = tuple(means.shape[:-2])
     N = means.shape[-2] if means.ndim > 2 else 0
@@ -150,17 +153,20 @@ def _clamped_perspective(
 
 @torch.no_grad()
 def compute_relocation(
-    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.005
 ) -> tuple[Tensor, Tensor]:
     """Return opacity and scales of each of n Gaussians that take the place of one without changing the image.
 
     o' = 1 - (1 - o)^(1/n),   s' = s o / sum_i=1..n sum_k=0..i-1 C(i-1, k) (-1)^k o'^(k+1) / sqrt(k + 1)
+
+    o' is clamped to [min_opacity, 1 - 2^-23] before the scales are computed, as in gsplat 1.6.0.
 
     Args:
         opacities: (N,) 0 to 1.
         scales: (N, 3) standard deviations.
         ratios: (N,) n, clamped to 1 and to the size of the table. Unlike gsplat's, this function does not change it.
         binoms: (n_max, n_max) binomial coefficients C(row, column), 0 above the diagonal.
+        min_opacity: Smallest new opacity, 0 to 1. 0 is the formula of gsplat 1.5.3.
 
     Returns:
         New opacities (N,) and scales (N, 3), of the dtype of `opacities`.
@@ -175,6 +181,7 @@ def compute_relocation(
     N = len(opacities) if opacities.ndim else 0
     expect("opacities", opacities, (N,), opacities)
     expect("scales", scales, (N, 3), opacities, "opacities")
+    in_range("min_opacity", min_opacity, 0.0, OPACITY_LIMIT)
     sizes = {"N": N}
     check_tensor("ratios", ratios, ("N",), sizes)
     check_tensor("binoms", binoms, ("n_max", "n_max"), sizes)
@@ -185,7 +192,7 @@ def compute_relocation(
         raise ArgumentError("binoms: is empty, but has to hold C(0, 0)")
     n = ratios.double().clamp(1, n_max).long()
     old = opacities.double()
-    new = 1.0 - (1.0 - old) ** (1.0 / n.double())
+    new = (1.0 - (1.0 - old) ** (1.0 / n.double())).clamp(min_opacity, OPACITY_LIMIT)
     # sums over i = 1..n of C(i-1, k): a row for each n
     counts = binoms.double().cumsum(dim=0)[n - 1]
     k = torch.arange(n_max, dtype=torch.float64)

@@ -11,20 +11,22 @@ known: a c - b² would cancel for thin Gaussians.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
 from gsplat_edu.base.constants import DET_FLOOR, THINNEST
+from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.validation import flag
 from gsplat_edu.compat.checks import (
+    check_camera_model,
     check_cameras,
     check_limits,
-    check_projection_options,
     check_scene,
     check_size,
+    check_sparse,
     expect,
 )
 from gsplat_edu.compat.lenses import KINDS_BY_MODEL, CameraModel, see
@@ -40,6 +42,38 @@ EXTENT = 3.33
 
 TRIANGLE = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 """Rows and columns of a covariance's upper triangle, in the order of six numbers."""
+
+
+def with_sparse_gradient(tensor: Tensor, rows: list[Tensor]) -> Tensor:
+    """Return the tensor, whose gradient will be a sparse COO tensor that holds each row once.
+
+    Args:
+        tensor: Any tensor.
+        rows: An empty list. Before the backward pass it gets one entry: the sorted rows whose gradient is not zero.
+    """
+    found: Tensor = _SparseRows.apply(tensor, rows)  # type: ignore[no-untyped-call]
+    return found
+
+
+@first_derivative_only("sparse_grad=True", "sparse_grad=False")
+class _SparseRows(torch.autograd.Function):
+    """The identity with a sparse gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, rows: list[Tensor]) -> Tensor:  # noqa: ANN401
+        """Return the tensor."""
+        ctx.rows = rows
+        return tensor.view_as(tensor)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+        """Keep the rows."""
+        (rows,) = ctx.rows
+        values = grad.index_select(0, rows)
+        sparse = torch.sparse_coo_tensor(
+            rows[None], values, grad.shape, check_invariants=True, is_coalesced=True
+        )
+        return sparse, None
 
 
 PLAIN_MODEL = CameraModel()
@@ -182,12 +216,12 @@ def fully_fused_projection(
     camera_model: str = "pinhole",
     opacities: Tensor | None = None,
 ) -> tuple[Tensor | None, ...]:
-    """Project Gaussians as gsplat 1.5.3's function of this name does; docs/GSPLAT.md lists the arguments.
+    """Project Gaussians as gsplat 1.6.0's function of this name does; docs/GSPLAT.md lists the arguments.
 
     Returns:
         radii (int32), means2d, depths, conics and compensations, of shape (..., C, N, ...); packed: batch_ids,
-        camera_ids and gaussian_ids, then the same of the Gaussians with positive radii only. Compensations are None
-        unless asked for.
+        camera_ids and gaussian_ids (int64), indptr, then the same of the Gaussians with positive radii only. Rows
+        indptr[i] to indptr[i + 1] (int32) are of image i, batch times C plus camera. Compensations may be None.
 
     Raises:
         ShapeError: a shape differs.
@@ -195,14 +229,16 @@ def fully_fused_projection(
 
     Differentiable in: means, covars, quats, scales, viewmats, Ks.
     """
-    check_projection_options(sparse_grad, camera_model)
+    check_camera_model(camera_model)
     check_size(width, height)
-    for name, value in (("packed", packed), ("calc_compensations", calc_compensations)):
+    flags = {"packed": packed, "calc_compensations": calc_compensations, "sparse_grad": sparse_grad}
+    for name, value in flags.items():
         flag(name, value)
     check_limits(near_plane, far_plane, radius_clip, eps2d)
     batch, N = check_scene(
         {"means": means, "quats": quats, "scales": scales, "opacities": opacities}, covars is not None
     )
+    check_sparse(sparse_grad, packed, batch)
     if covars is not None:
         expect("covars", covars, (*batch, N, 6), means)
     C = check_cameras(viewmats, Ks, batch, means)
@@ -210,9 +246,24 @@ def fully_fused_projection(
     flat = None if opacities is None else opacities.reshape(math.prod(batch), N)
     model = CameraModel(KINDS_BY_MODEL[camera_model])
     views = (viewmats.reshape(-1, C, 4, 4), Ks.reshape(-1, C, 3, 3))
+    touched: list[Tensor] = []
+    if sparse_grad:
+        means = with_sparse_gradient(means, touched)
+        covars, quats, scales = (
+            None if each is None else with_sparse_gradient(each, touched) for each in (covars, quats, scales)
+        )
     found = project(solids_of(means, covars, quats, scales), *views, lens, flat, calc_compensations, model)
     results = [*found[:4], found.compensations if calc_compensations else None]
     if not packed:
         return tuple(None if each is None else each.view(*batch, C, N, *each.shape[3:]) for each in results)
-    drawn = (found.radii > 0).all(dim=-1)
-    return (*drawn.nonzero().unbind(-1), *(None if each is None else each[drawn] for each in results))
+    return _packed(results, touched)
+
+
+def _packed(results: list[Tensor | None], touched: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """Return ids, indptr and the drawn rows of the results, of which the first are radii; say which rows they are."""
+    assert results[0] is not None
+    drawn = (results[0] > 0).all(dim=-1)
+    touched.append(drawn.any(dim=(0, 1)).nonzero()[:, 0])
+    indptr = torch.nn.functional.pad(drawn.sum(dim=-1).flatten().cumsum(0), (1, 0)).int()
+    rows = (None if each is None else each[drawn] for each in results)
+    return (*drawn.nonzero().unbind(-1), indptr, *rows)

@@ -48,8 +48,8 @@ def without_bad_gaussians(given: dict[str, Any]) -> dict[str, Any]:
     own = {name: t for name, t in given.items() if name in PLAIN and isinstance(t, Tensor)}
     bad = torch.zeros(means.shape[:-1], dtype=torch.bool)
     degrees = {name: given[degree] for name, degree in DEGREES.items()}
-    # Coefficients of extra signals have no leading axes: a bad row of theirs is bad in every scene.
-    shared = {"extra_signals"} if degrees["extra_signals"] is not None else set()
+    # Coefficients without leading axes are shared: a bad row of theirs is bad in every scene.
+    shared = {name for name in own if degrees.get(name) is not None and own[name].ndim == 3}
     cameras, axes = bad.ndim - 1, bad.ndim
     per_camera = {
         name

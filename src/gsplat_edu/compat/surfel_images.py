@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsplat_edu.base.derivatives import first_derivative_only
 from gsplat_edu.base.validation import flag
-from gsplat_edu.compat.images import absgrad_store
+from gsplat_edu.compat.images import Absgrad
 from gsplat_edu.compat.tiles import checked_lists
 from gsplat_edu.ops.kernels import kernel, native_array
 
@@ -217,15 +217,16 @@ def _composited(a: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
     begin = offsets.reshape(-1, *offsets.shape[-2:])
     if a["masks"] is not None:
         begin, rows = _without(a["masks"], begin, rows)
+    kept = Absgrad(means2d) if a["absgrad"] else None
     surfels = Surfels(
-        means2d.reshape(-1, 2),
+        (means2d if kept is None else kept.means2d).reshape(-1, 2),
         shifted(a["ray_transforms"], a["densify"]).reshape(-1, 3, 3),
         a["opacities"].reshape(-1),
         a["colors"].reshape(-1, D),
         a["normals"].reshape(-1, 3),
     )
     lists = TileLists(a["image_width"], a["image_height"], a["tile_size"], begin, rows)
-    store = absgrad_store(means2d, torch.arange(len(surfels.means2d))) if a["absgrad"] else None
+    store = None if kept is None else kept.adder(torch.arange(len(surfels.means2d)))
     found = composite_surfels(surfels, lists, store)
     T, image = found.transmittance[..., None], found.image
     if a["backgrounds"] is not None:

@@ -29,12 +29,11 @@ from gsplat_edu.compat.checks import (
     RollingShutterType,
     check_cameras,
     check_limits,
-    check_projection_options,
     check_scene,
     check_size,
 )
 from gsplat_edu.compat.drawn import Drawn, colors_of, drawn_at, joined
-from gsplat_edu.compat.images import absgrad_store
+from gsplat_edu.compat.images import Absgrad
 from gsplat_edu.compat.projection import EXTENT, Lens
 from gsplat_edu.compat.skipping import without_bad_gaussians
 from gsplat_edu.compat.surfel_images import SurfelImages, Surfels, TileLists, composite_surfels, shifted
@@ -132,6 +131,12 @@ def _radii(
     return torch.where(drawn[..., None], radii.clamp(max=MOST_RADIUS), 0.0).to(torch.int32)
 
 
+def _check_dense(sparse_grad: object) -> None:
+    """Refuse sparse gradients."""
+    if flag("sparse_grad", sparse_grad):
+        raise ArgumentError("sparse_grad: is True, but 2D Gaussians have dense gradients only; pass False")
+
+
 def fully_fused_projection_2dgs(
     means: Tensor,
     quats: Tensor,
@@ -159,7 +164,7 @@ def fully_fused_projection_2dgs(
 
     Differentiable in: means, quats, scales, viewmats, Ks.
     """
-    check_projection_options(sparse_grad, "pinhole")
+    _check_dense(sparse_grad)
     check_size(width, height)
     check_limits(near_plane, far_plane, radius_clip, eps2d)
     named: dict[str, Tensor | None] = {"means": means, "quats": quats, "scales": scales, "opacities": None}
@@ -219,6 +224,7 @@ def rasterization_2dgs(
     Differentiable in: every tensor, those of the cameras included.
     """
     given = {name: value for name, value in locals().items() if name not in ("distloss", "depth_mode")}
+    _check_dense(sparse_grad)
     a = Arguments(**without_bad_gaussians(PLAIN | given))
     one_of("depth_mode", depth_mode, ("expected", "median"))
     if flag("distloss", distloss) and a.render_mode == "RGB":
@@ -257,13 +263,15 @@ def _drawn_images(a: Arguments) -> tuple[SurfelImages, dict[str, Any]]:
         "render fewer images, or fewer pixels (width, height)",
     )
     meta, drawn, rows = _projected(a)
+    kept = Absgrad(meta["means2d"]) if a.absgrad else None
     used = meta | {"ray_transforms": shifted(meta["ray_transforms"], meta["gradient_2dgs"])}
+    used |= {} if kept is None else {"means2d": kept.means2d}
     own = {name: joined(field, meta["depths"].ndim).index_select(0, rows) for name, field in used.items()}
     lists, listed = _lists(a, drawn, own)
     colors = [] if a.render_mode in DEPTH_ONLY or a.colors is None else [colors_of(a, a.colors, drawn)]
     colors += [] if a.render_mode == "RGB" else [own["depths"][:, None]]
     numbers = (own["opacities"], torch.cat(colors, dim=-1), own["normals"])
-    store = absgrad_store(meta["means2d"], rows) if a.absgrad else None
+    store = None if kept is None else kept.adder(rows)
     found = composite_surfels(Surfels(own["means2d"], own["ray_transforms"], *numbers), lists, store)
     ids = (drawn.scenes, drawn.images % a.C, drawn.gaussians) if a.packed else (None, None, None)
     named = dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), ids, strict=True))

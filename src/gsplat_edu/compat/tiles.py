@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gsplat_edu.base.constants import ALPHA_MIN
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import flag, whole_number
 from gsplat_edu.compat.checks import MOST_PIXELS, check_size, expect, real_tensor
-from gsplat_edu.compat.images import Splats, absgrad_store, composite
-from gsplat_edu.compat.projection import Lens
+from gsplat_edu.compat.images import Absgrad, Splats, composite
+from gsplat_edu.compat.projection import EXTENT, Lens
 from gsplat_edu.scene.gaussians import check_tensor
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
@@ -39,8 +40,13 @@ def isect_tiles(
     n_images: int | None = None,
     image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """List the pairs of Gaussians and tiles that their boxes meet, as gsplat's function of this name does.
+
+    With conics A, B, C and opacities o, only tiles are listed that the ellipse of alpha >= 1/255 meets, as in gsplat
+    1.6.0: A x² + 2 B x y + C y² <= min(3.33², 2 ln(255 o)) at a point (x, y) of the tile, from the centre.
 
     Args:
         means2d: (..., N, 2) centres, px; packed (nnz, 2).
@@ -55,34 +61,47 @@ def isect_tiles(
         n_images: Number of images, with `packed`.
         image_ids: (nnz,) image of each row, with `packed`.
         gaussian_ids: Not read; gsplat asks for it with `packed`.
+        conics: (..., N, 3) inverses of the dilated covariances, xx, xy, yy, per px²; no effect without opacities.
+        opacities: (..., N) 0 to 1; no effect without conics.
 
     Returns:
         int32 (..., N) tiles of each Gaussian; int64 ids, image | tile | 32 bits of the depth; int32 rows of the inputs.
 
     Raises:
         ShapeError: a shape differs.
-        ArgumentError: a value is not finite or out of range.
+        ArgumentError: a value is not finite or out of range, or a conic of a positive radius is not positive definite.
     """
     real_tensor("means2d", means2d)
     flag("sort", sort), flag("segmented", segmented)
-    leading = tuple(means2d.shape[:-1])
-    expect("means2d", means2d, (*leading, 2), means2d)
-    for name, tensor, shape in (("radii", radii, (*leading, 2)), ("depths", depths, leading)):
-        check_tensor(name, tensor, ("...",), {})
-        if tuple(tensor.shape) != shape:
-            raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
+    leading = _check_splats(means2d, radii, depths, conics, opacities)
     sizes = {"tile_size": tile_size, "tile_width": tile_width, "tile_height": tile_height}
     for name, size in sizes.items():
         whole_number(name, size, 1, MOST_PIXELS)
     images, count = _images(leading, flag("packed", packed), n_images, image_ids, gaussian_ids)
     bits = _tile_bits(tile_width, tile_height, count)
-    tiles, rows, places = _boxes(means2d.reshape(-1, 2), radii.reshape(-1, 2), sizes)
+    tiles, rows, places = _pairs(means2d.reshape(-1, 2), radii.reshape(-1, 2), conics, opacities, sizes)
     deep = depths.reshape(-1).float().view(torch.int32).long() & (2**DEPTH_BITS - 1)
     ids = ((images[rows] << bits | places) << DEPTH_BITS) | deep[rows]
     if sort:
         ids, order = torch.sort(ids, stable=True)
         rows = rows[order]
     return tiles.view(leading).int(), ids, rows.int()
+
+
+def _check_splats(
+    means2d: Tensor, radii: Tensor, depths: Tensor, conics: Tensor | None, opacities: Tensor | None
+) -> tuple[int, ...]:
+    """Check the tensors of `isect_tiles`; return their leading axes."""
+    leading = tuple(means2d.shape[:-1])
+    expect("means2d", means2d, (*leading, 2), means2d)
+    for name, tensor, shape in (("radii", radii, (*leading, 2)), ("depths", depths, leading)):
+        check_tensor(name, tensor, ("...",), {})
+        if tuple(tensor.shape) != shape:
+            raise ShapeError(f"{name}: has shape {tuple(tensor.shape)}, but has to be {shape}")
+    for name, given, tail in (("conics", conics, (3,)), ("opacities", opacities, ())):
+        if given is not None:
+            expect(name, given, (*leading, *tail), means2d, "means2d")
+    return leading
 
 
 def _boxes(means2d: Tensor, radii: Tensor, sizes: dict[str, int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -98,6 +117,52 @@ def _boxes(means2d: Tensor, radii: Tensor, sizes: dict[str, int]) -> tuple[Tenso
     columns = spans[rows, 0]
     x, y = low[rows, 0] + place % columns, low[rows, 1] + place // columns
     return tiles, rows, y * sizes["tile_width"] + x
+
+
+def _pairs(
+    centres: Tensor, halves: Tensor, conics: Tensor | None, opacities: Tensor | None, sizes: dict[str, int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pairs by ellipses if there are conics and opacities, else by boxes; see `_boxes`."""
+    if conics is None or opacities is None:
+        return _boxes(centres, halves, sizes)
+    ellipses = _Ellipses(centres.double(), conics.reshape(-1, 3).double(), _levels(opacities.reshape(-1)))
+    return _met_by(ellipses, (halves > 0).all(dim=-1), sizes)
+
+
+class _Ellipses(NamedTuple):
+    """Points within a level of the quadratic forms of conics."""
+
+    centres: Tensor
+    conics: Tensor
+    levels: Tensor
+
+
+def _levels(opacities: Tensor) -> Tensor:
+    """Return the quadratic forms where alpha is 1/255, at most gsplat's extent; -1 where it is lower everywhere."""
+    levels = (2.0 * torch.log(opacities.double().clamp(min=ALPHA_MIN) / ALPHA_MIN)).clamp(max=EXTENT**2)
+    return torch.where(opacities < ALPHA_MIN, -1.0, levels)
+
+
+def _met_by(ellipses: _Ellipses, drawn: Tensor, sizes: dict[str, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what `_boxes` returns, of the tiles that ellipses meet."""
+    drawn = drawn & (ellipses.levels >= 0)
+    listed = drawn.nonzero()[:, 0]
+    spreads = _covariances(ellipses.conics, listed)[:, [0, 2]]
+    halves = (spreads * ellipses.levels[:, None].clamp(min=0)).sqrt() * drawn[:, None]
+    tiles, rows, places = _boxes(ellipses.centres, halves, sizes)
+    tile = torch.stack([places % sizes["tile_width"], places // sizes["tile_width"]], dim=-1)
+    low = tile * sizes["tile_size"] - ellipses.centres[rows]  # the corner, from the centre
+    high = low + sizes["tile_size"]
+    # The form is convex: its minimum over a tile is at the centre or on an edge.
+    least = torch.where(((low <= 0) & (high >= 0)).all(dim=-1), 0.0, math.inf)
+    A, B, C = ellipses.conics[rows].unbind(-1)
+    for axis, along, across in ((0, A, C), (1, C, A)):
+        for edge in (low[:, axis], high[:, axis]):
+            free = torch.clamp(-B * edge / across, low[:, 1 - axis], high[:, 1 - axis])
+            least = torch.minimum(least, along * edge**2 + 2 * B * edge * free + across * free**2)
+    met = least <= ellipses.levels[rows]
+    rows = rows[met]
+    return torch.bincount(rows, minlength=len(tiles)), rows, places[met]
 
 
 def _images(
@@ -210,10 +275,10 @@ def rasterize_to_pixels(
 
     Differentiable in: means2d, conics, colors, opacities, backgrounds.
     """
-    return _composited(_Tiles(**checked_lists({"conics": (3,)}, **locals())))
+    return _composited(Tiles(**checked_lists({"conics": (3,)}, **locals())))
 
 
-class _Tiles(NamedTuple):
+class Tiles(NamedTuple):
     """Checked arguments of `rasterize_to_pixels`."""
 
     means2d: Tensor
@@ -231,12 +296,14 @@ class _Tiles(NamedTuple):
     absgrad: bool
 
 
-def _composited(a: _Tiles) -> tuple[Tensor, Tensor]:
+def _composited(a: Tiles) -> tuple[Tensor, Tensor]:
     """Composite tile after tile, and join them."""
     starts, rows, D = a.isect_offsets.flatten().tolist(), a.flatten_ids, a.colors.shape[-1]
     rows_of_tiles, tiles_x = a.isect_offsets.shape[-2:]
     lens = Lens(a.tile_size, a.tile_size, 0.0, 0.0, math.inf, 0.0)
-    means2d, colors, opacities = a.means2d.reshape(-1, 2), a.colors.reshape(-1, D), a.opacities.reshape(-1)
+    kept = Absgrad(a.means2d) if a.absgrad else None
+    means2d = (a.means2d if kept is None else kept.means2d).reshape(-1, 2)
+    colors, opacities = a.colors.reshape(-1, D), a.opacities.reshape(-1)
     spreads = _covariances(a.conics.reshape(-1, 3), rows)
     images, alphas = [], []
     for tile, (begin, end) in enumerate(zip(starts, [*starts[1:], len(rows)], strict=True)):
@@ -246,7 +313,7 @@ def _composited(a: _Tiles) -> tuple[Tensor, Tensor]:
         own = rows[begin:end] if drawn else rows[:0]
         behind = None if a.backgrounds is None else a.backgrounds.reshape(-1, D)[image]
         splats = Splats(means2d[own] - corner, spreads[own], opacities[own], colors[own], None, behind)
-        shown, T = composite(splats, lens, absgrad_store(a.means2d, own) if a.absgrad else None)
+        shown, T = composite(splats, lens, None if kept is None else kept.adder(own))
         images.append(shown)
         alphas.append(1.0 - T[..., None])
     shape = (*a.isect_offsets.shape[:-2], a.image_height, a.image_width)
@@ -282,11 +349,16 @@ def _covariances(conics: Tensor, rows: Tensor) -> Tensor:
     return torch.stack(parts, dim=-1)
 
 
-def checked_lists(tails: dict[str, tuple[int, ...]], **a: Any) -> dict[str, Any]:  # noqa: ANN401
+def checked_lists(
+    tails: dict[str, tuple[int, ...]],
+    named: str = "isect_offsets",
+    **a: Any,  # noqa: ANN401
+) -> dict[str, Any]:
     """Check the arguments of a rasteriser by lists; return them with int64 lists.
 
     Args:
         tails: Last axes of the arguments that only this rasteriser has, which begin with those of `means2d`.
+        named: The caller's name of the offsets.
         a: The arguments.
 
     Raises:
@@ -303,23 +375,22 @@ def checked_lists(tails: dict[str, tuple[int, ...]], **a: Any) -> dict[str, Any]
     D = a["colors"].shape[-1] if a["colors"].ndim else 0
     for name, tail in (tails | {"colors": (max(D, 1),), "opacities": ()}).items():
         expect(name, a[name], (*leading, *tail), means2d, "means2d")
-    offsets, rows = (whole_numbers(name, a[name]) for name in ("isect_offsets", "flatten_ids"))
+    offsets, rows = (
+        whole_numbers(name, a[key])
+        for name, key in ((named, "isect_offsets"), ("flatten_ids", "flatten_ids"))
+    )
     images = tuple(offsets.shape[:-2]) if packed else leading[:-1]
     if offsets.ndim < 2 or tuple(offsets.shape[:-2]) != images:
         raise ShapeError(
-            f"isect_offsets: has shape {tuple(offsets.shape)}, but has to be {(*images, 'rows', 'columns')}"
+            f"{named}: has shape {tuple(offsets.shape)}, but has to be {(*images, 'rows', 'columns')}"
         )
     if offsets.shape[-2] * edge < a["image_height"] or offsets.shape[-1] * edge < a["image_width"]:
-        raise ShapeError(
-            f"isect_offsets: has {tuple(offsets.shape[-2:])} tiles, which do not cover the image"
-        )
+        raise ShapeError(f"{named}: has {tuple(offsets.shape[-2:])} tiles, which do not cover the image")
     if rows.ndim != 1 or ids_outside(rows, math.prod(leading)):
         raise ArgumentError(f"flatten_ids: has to hold rows of the inputs, 0 to {math.prod(leading) - 1}")
     flat = offsets.flatten()
     if bool((flat.diff() < 0).any()) or ids_outside(flat, len(rows) + 1) or (len(flat) and int(flat[0])):
-        raise ArgumentError(
-            f"isect_offsets: has to grow from 0 to at most {len(rows)}, the length of flatten_ids"
-        )
+        raise ArgumentError(f"{named}: has to grow from 0 to at most {len(rows)}, the length of flatten_ids")
     if a["backgrounds"] is not None:
         expect("backgrounds", a["backgrounds"], (*images, D), means2d, "means2d")
     masks = a["masks"]
