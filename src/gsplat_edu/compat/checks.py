@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -212,10 +213,8 @@ class Arguments:
         for name in ("packed", "absgrad", "sparse_grad", "segmented", "with_ut"):
             flag(name, getattr(self, name))
         check_size(self.width, self.height)
-        if self.tile_size is None:
-            object.__setattr__(self, "tile_size", TILE)
-        for name in ("tile_size", "channel_chunk"):
-            whole_number(name, getattr(self, name), 1)
+        for name, count in (("tile_size", self.edge), ("channel_chunk", self.channel_chunk)):
+            whole_number(name, count, 1)
         check_limits(self.near_plane, self.far_plane, self.radius_clip, self.eps2d)
         named = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
         batch, N = check_scene(named, self.covars is not None)
@@ -311,6 +310,18 @@ class Arguments:
                 tensor = tensor.to(self.means.dtype)
         expect(name, tensor, (*lead, self.N, *tail), self.means)
         return channels
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> Arguments:
+        """Return the arguments with other tensors of the same shapes, which are not checked."""
+        found = copy.copy(self)
+        for name, tensor in tensors.items():
+            object.__setattr__(found, name, tensor)
+        return found
+
+    @property
+    def edge(self) -> int:
+        """Edge of a tile, px."""
+        return TILE if self.tile_size is None else self.tile_size
 
     @property
     def colors_per_camera(self) -> bool:

@@ -25,8 +25,8 @@ what is on the screen once more, which `gsplat_edu.render.api.render` need not d
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -54,13 +54,14 @@ from gsplat_edu.compat.lenses import cameras_of
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
 from gsplat_edu.compat.projection import (
     TRIANGLE,
-    Lens,
     fully_fused_projection,
     project,
     solids_of,
     with_sparse_gradient,
 )
+from gsplat_edu.compat.screen import Lens
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
+from gsplat_edu.compat.stages import stage
 from gsplat_edu.compat.surfel_images import rasterize_to_pixels_2dgs
 from gsplat_edu.compat.surfels import fully_fused_projection_2dgs, rasterization_2dgs
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
@@ -168,62 +169,98 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
         shapes = {name: getattr(a, name) for name in ("means", "quats", "scales", "covars")}
         used = {name: tensor for name, tensor in shapes.items() if tensor is not None}
         sparse: Any = {name: with_sparse_gradient(tensor, touched) for name, tensor in used.items()}
-        a = replace(a, **sparse)
-    lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
+        a = a.with_tensors(sparse)
+    given = {each.name: getattr(a, each.name) for each in fields(a)}
+    tensors = {name: value for name, value in given.items() if isinstance(value, Tensor)}
+
+    def geometry(*values: Tensor) -> list[Tensor]:
+        return _geometry(a.with_tensors(dict(zip(tensors, values, strict=True))))
+
+    positions, spreads, *found = stage(geometry, *tensors.values())
+    drawn = drawn_at(positions, a)
+    if a.sparse_grad:
+        touched.append(drawn.gaussians.bincount().nonzero()[:, 0])
+    meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
+    if a.packed:
+        meta = {"batch_ids": drawn.scenes, "camera_ids": drawn.images % a.C, "gaussian_ids": drawn.gaussians}
+    meta |= dict(zip(META, found, strict=True))
+    meta |= {"width": a.width, "height": a.height, "tile_size": a.edge}
+    meta |= {"n_batches": a.batches, "n_cameras": a.C}
+    for name, size in (("tile_width", a.width), ("tile_height", a.height)):
+        meta[name] = math.ceil(size / a.edge)
+    kept = Absgrad(meta["means2d"]) if a.absgrad else None
+    on_screen = (meta["means2d"] if kept is None else kept.means2d, meta["depths"], meta["opacities"])
+
+    def images(
+        means2d: Tensor, depths: Tensor, opacities: Tensor, spreads: Tensor, *values: Tensor
+    ) -> list[Tensor]:
+        own = a.with_tensors(dict(zip(tensors, values, strict=True)))
+        return _images(own, drawn, _OnScreen(means2d, depths, opacities, spreads), kept)
+
+    image, alphas, *signals = stage(images, *on_screen, spreads, *tensors.values())
+    if signals:
+        meta["render_extra_signals"] = signals[0]
+    return image, alphas, meta
+
+
+META = ("radii", "means2d", "depths", "conics", "opacities")
+"""The tensors of `meta` that both stages share."""
+
+
+class _OnScreen(NamedTuple):
+    """Tensors of `meta`, and the spreads of the drawn Gaussians."""
+
+    means2d: Tensor
+    depths: Tensor
+    opacities: Tensor
+    spreads: Float[Tensor, "nnz 3"]
+
+
+def _lens(a: Arguments) -> Lens:
+    return Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
+
+
+def _geometry(a: Arguments) -> list[Tensor]:
+    """Return the positions of the drawn Gaussians in (B C N), their spreads, and the tensors of `META`."""
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)
     flat, antialiased = a.opacities.reshape(a.batches, a.N), a.rasterize_mode == "antialiased"
     solids = solids_of(a.means, triangle, a.quats, a.scales)
-    found = project(solids, viewmats, Ks, lens, flat, antialiased, model)
+    found = project(solids, viewmats, Ks, _lens(a), flat, antialiased, model)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
     spreads = joined(found.spreads, 3).index_select(0, positions)
     check_spreads("scales" if a.covars is None else "covars", spreads, positions, (a.batch, a.C, a.N))
-    drawn = drawn_at(positions, a)
-    if a.sparse_grad:
-        touched.append(drawn.gaussians.bincount().nonzero()[:, 0])
     opacities = flat[:, None].expand(-1, a.C, -1)
     if antialiased:
         opacities = opacities * found.compensations
-    fields = {
-        "radii": found.radii,
-        "means2d": found.means2d,
-        "depths": found.depths,
-        "conics": found.conics,
-        "opacities": opacities,
-    }
-    meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
+    shared = [found.radii, found.means2d, found.depths, found.conics, opacities]
     if a.packed:
-        meta = {"batch_ids": drawn.scenes, "camera_ids": drawn.images % a.C, "gaussian_ids": drawn.gaussians}
-        meta |= {name: joined(field, 3).index_select(0, positions) for name, field in fields.items()}
+        shared = [joined(field, 3).index_select(0, positions) for field in shared]
     else:
-        meta |= {name: field.view(*a.batch, a.C, a.N, *field.shape[3:]) for name, field in fields.items()}
-    meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
-    meta |= {"n_batches": a.batches, "n_cameras": a.C}
-    for name, size in (("tile_width", a.width), ("tile_height", a.height)):
-        meta[name] = math.ceil(size / meta["tile_size"])
-    views = _draw(a, lens, drawn, spreads, meta)
+        shared = [field.reshape(*a.batch, a.C, a.N, *field.shape[3:]) for field in shared]
+    return [positions, spreads, *shared]
+
+
+def _images(a: Arguments, drawn: Drawn, on_screen: _OnScreen, kept: Absgrad | None) -> list[Tensor]:
+    """Return images, alphas and, if there are any, extra signals."""
+    views = _draw(a, drawn, on_screen, kept)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
-    alphas = 1.0 - transmittance[..., None]
+    alphas, signals = 1.0 - transmittance[..., None], []
     if a.extra_signals is not None:
         E = a.extra_signals.shape[-1]
         first = image.shape[-1] - E - int(a.render_mode != "RGB")
-        meta["render_extra_signals"] = image[..., first : first + E]
+        signals = [image[..., first : first + E]]
         image = torch.cat([image[..., :first], image[..., first + E :]], dim=-1)
     if a.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)
-    return image, alphas, meta
+    return [image, alphas, *signals]
 
 
 def _draw(
-    a: Arguments,
-    lens: Lens,
-    drawn: Drawn,
-    spreads: Float[Tensor, "nnz 3"],
-    meta: dict[str, Any],
+    a: Arguments, drawn: Drawn, on_screen: _OnScreen, kept: Absgrad | None
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Draw every image, given the spreads of the drawn Gaussians."""
-    kept = Absgrad(meta["means2d"]) if a.absgrad else None
-    own = [meta["means2d"] if kept is None else kept.means2d, meta["depths"], meta["opacities"]]
+    """Draw every image."""
+    *own, spreads = on_screen
     rows = torch.arange(len(spreads)) if a.packed else drawn.positions  # in the tensors of `meta`
     if not a.packed:
         own = [joined(each, len(a.batch) + 2).index_select(0, rows) for each in own]
@@ -247,7 +284,7 @@ def _draw(
             None if signals is None else signals[part],
             order=depths.detach()[part] + 0.0,  # not -0
         )
-        image, transmittance = composite(splats, lens, None if kept is None else kept.adder(rows[part]))
+        image, transmittance = composite(splats, _lens(a), None if kept is None else kept.adder(rows[part]))
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances

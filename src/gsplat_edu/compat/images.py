@@ -111,7 +111,7 @@ def _render(
         found, visible = view.collect("absgrad"), view.visible
         # The hook runs when the kernels' backward pass has returned the gradient of the means. It holds no tensor of
         # the image: that would be a circle of references through the graph.
-        means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))  # type: ignore[no-untyped-call]
+        means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))
     return view
 
 

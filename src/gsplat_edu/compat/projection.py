@@ -142,8 +142,8 @@ def project(
         found = _through_lens(solids, viewmats, Ks, lens, model)
     given = None if opacities is None else opacities[:, None].expand(found.depths.shape)
     radii = box_radii(found, given, compensated, lens, EXTENT)
-    outputs = (found.centres, found.depths, found.conics, found.compensations)
-    return Projected(radii, *(each.to(dtype) for each in outputs), found.spreads)
+    centres, depths, conics, compensations = (each.to(dtype) for each in found[:4])
+    return Projected(radii, centres, depths, conics, compensations, found.spreads)
 
 
 def _through_lens(
@@ -154,7 +154,7 @@ def _through_lens(
     model: CameraModel,
 ) -> OnScreen:
     """Project through a lens or a rolling shutter, as `through_pinhole` does through a pinhole."""
-    solids = Solids(*(None if each is None else each.double() for each in solids))
+    solids = Solids(solids.means.double(), *(None if each is None else each.double() for each in solids[1:]))
     R, t = viewmats[..., :3, :3], viewmats[..., None, :3, 3]
     depths = (solids.means[:, None] @ R.mT + t)[..., 2]
     before = (depths >= lens.near) & (depths <= lens.far)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
 
 from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.threads import native_threads
 from gsplat_edu.ops.kernels import kernel, native_array
 
 INSTEAD = 'render of gsplat_edu with backend="torch"'
@@ -68,7 +69,8 @@ def through_pinhole(
     Differentiable in: solids, viewmats, Ks. What is not between near and far has a depth of 1 in all formulas but its
     own.
     """
-    return OnScreen(*_Screen.apply((lens, margin), *solids, viewmats, Ks))
+    found = _Screen.apply((lens, margin), *solids, viewmats, Ks)  # type: ignore[no-untyped-call]
+    return OnScreen(*found)
 
 
 @first_derivative_only("gsplat's projection", INSTEAD)
@@ -127,8 +129,8 @@ class _Screen(torch.autograd.Function):
 def _cameras(limits: tuple[Lens, float], kept: Sequence[Tensor | None], viewmats: Tensor, Ks: Tensor) -> Any:  # noqa: ANN401
     """Yield batch, camera and the arguments of the kernel for each camera."""
     lens, margin = limits
-    common = {"margin": margin, "eps2d": lens.eps2d, "z_near": lens.near, "z_far": lens.far}
-    common |= {"size": (lens.width, lens.height), "threads": torch.get_num_threads()}
+    common: dict[str, Any] = {"margin": margin, "eps2d": lens.eps2d, "z_near": lens.near, "z_far": lens.far}
+    common |= {"size": (lens.width, lens.height), "threads": native_threads()}
     matrices, intrinsics = viewmats[..., :3, :].flatten(2).tolist(), Ks.tolist()
     for b, rows in enumerate(matrices):
         given = dict(zip(("means", "covars", "quats", "scales"), kept, strict=True))
@@ -162,7 +164,7 @@ def box_radii(
         eps2d=lens.eps2d,
         extent=extent,
         radius_clip=lens.radius_clip,
-        threads=torch.get_num_threads(),
+        threads=native_threads(),
     )
     return radii
 
@@ -185,7 +187,8 @@ def harmonic_colors(
 
     Differentiable in: directions, coefficients.
     """
-    return _Harmonics.apply(degree, directions, coefficients, rows, ends)  # type: ignore[no-any-return]
+    found: Tensor = _Harmonics.apply(degree, directions, coefficients, rows, ends)  # type: ignore[no-untyped-call]
+    return found
 
 
 @first_derivative_only("gsplat's harmonics", INSTEAD)
@@ -234,6 +237,6 @@ def _images(degree: int, directions: Tensor, coefficients: Tensor, rows: Tensor,
                 "directions": native_array(directions[part]),
                 "coefficients": native_array(coefficients),
                 "rows": native_array(rows[part]),
-                "threads": torch.get_num_threads(),
+                "threads": native_threads(),
             },
         )

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.threads import native_threads
 from gsplat_edu.base.validation import flag
 from gsplat_edu.compat.images import Absgrad
 from gsplat_edu.compat.tiles import checked_lists
@@ -148,7 +149,7 @@ def _arguments(arrays: dict[str, Tensor], lists: TileLists) -> dict[str, Any]:
         "edge": lists.tile_size,
         "tiles_y": lists.begin.shape[1],
         "tiles_x": lists.begin.shape[2],
-        "threads": torch.get_num_threads(),
+        "threads": native_threads(),
     }
 
 

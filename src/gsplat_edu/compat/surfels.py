@@ -34,7 +34,8 @@ from gsplat_edu.compat.checks import (
 )
 from gsplat_edu.compat.drawn import Drawn, colors_of, drawn_at, joined
 from gsplat_edu.compat.images import Absgrad
-from gsplat_edu.compat.projection import EXTENT, Lens
+from gsplat_edu.compat.projection import EXTENT
+from gsplat_edu.compat.screen import Lens
 from gsplat_edu.compat.skipping import without_bad_gaussians
 from gsplat_edu.compat.surfel_images import SurfelImages, Surfels, TileLists, composite_surfels, shifted
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles
@@ -275,7 +276,7 @@ def _drawn_images(a: Arguments) -> tuple[SurfelImages, dict[str, Any]]:
     found = composite_surfels(Surfels(own["means2d"], own["ray_transforms"], *numbers), lists, store)
     ids = (drawn.scenes, drawn.images % a.C, drawn.gaussians) if a.packed else (None, None, None)
     named = dict(zip(("batch_ids", "camera_ids", "gaussian_ids"), ids, strict=True))
-    sizes = {name: getattr(a, name) for name in ("width", "height", "tile_size")}
+    sizes = {"width": a.width, "height": a.height, "tile_size": a.edge}
     return found, meta | listed | named | sizes | {"n_batches": a.batches, "n_cameras": a.C}
 
 
@@ -297,13 +298,13 @@ def _projected(a: Arguments) -> tuple[dict[str, Any], Drawn, Tensor]:
 
 def _lists(a: Arguments, drawn: Drawn, own: dict[str, Tensor]) -> tuple[TileLists, dict[str, Any]]:
     """Return the tiles' lists of rows of the drawn splats, `own`, and what `meta` has of them."""
-    columns, rows = (math.ceil(size / a.tile_size) for size in (a.width, a.height))
+    columns, rows = (math.ceil(size / a.edge) for size in (a.width, a.height))
     images = a.batches * a.C
     tiles, ids, listed = isect_tiles(
         own["means2d"],
         own["radii"],
         own["depths"],
-        a.tile_size,
+        a.edge,
         columns,
         rows,
         packed=True,
@@ -312,7 +313,7 @@ def _lists(a: Arguments, drawn: Drawn, own: dict[str, Tensor]) -> tuple[TileList
         gaussian_ids=drawn.gaussians,
     )
     offsets = isect_offset_encode(ids, images, columns, rows)
-    lists = TileLists(a.width, a.height, a.tile_size, offsets.long(), listed.long())
+    lists = TileLists(a.width, a.height, a.edge, offsets.long(), listed.long())
     if not a.packed:
         none = tiles.new_zeros(images * a.N)
         tiles = none.index_copy(0, drawn.positions, tiles).view(*a.batch, a.C, a.N)

@@ -16,7 +16,8 @@ from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import flag, whole_number
 from gsplat_edu.compat.checks import MOST_PIXELS, check_size, expect, real_tensor
 from gsplat_edu.compat.images import Absgrad, Splats, composite
-from gsplat_edu.compat.projection import EXTENT, Lens
+from gsplat_edu.compat.projection import EXTENT
+from gsplat_edu.compat.screen import Lens
 from gsplat_edu.scene.gaussians import check_tensor
 
 WHOLE = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)

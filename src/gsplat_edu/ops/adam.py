@@ -15,7 +15,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.threads import native_threads, one_thread
 from gsplat_edu.ops import kernels
 from gsplat_edu.ops.moments import AdamNumbers
 
@@ -45,7 +45,7 @@ def adam_natively(
         second=kernels.native_array(second),
         gradient=kernels.native_array(gradient.to(parameter.dtype).contiguous()),
         **numbers._asdict(),
-        threads=torch.get_num_threads(),
+        threads=native_threads(),
     )
     torch.autograd.graph.increment_version(parameter)  # so that autograd knows of the change
 

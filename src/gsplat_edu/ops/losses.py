@@ -14,7 +14,7 @@ from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.constants import SSIM_C1, SSIM_C2, SSIM_SIGMA
 from gsplat_edu.base.derivatives import chained, first_derivative_only, opaque, refuse_halves
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.threads import native_threads, one_thread
 from gsplat_edu.base.validation import check_shape, in_range
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 
@@ -209,7 +209,7 @@ class _L1Ssim(torch.autograd.Function):
             target=native_array(y),
             gradient=native_array(gradient),
             ssim_weight=ssim_weight,
-            threads=torch.get_num_threads(),
+            threads=native_threads(),
         )
         ctx.save_for_backward(gradient)
         return x.new_tensor((1.0 - ssim_weight) * l1_mean + ssim_weight * (1.0 - ssim_mean))

@@ -16,7 +16,7 @@ from torch import Tensor
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.threads import native_threads, one_thread
 from gsplat_edu.base.validation import check_shape, whole_number
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.ops.lenses import native_camera, native_rays, within_width
@@ -393,7 +393,7 @@ class _PatchError(torch.autograd.Function):
             least_alpha=LEAST_ALPHA,
             least_cosine=LEAST_COSINE,
             least_spread=LEAST_SPREAD,
-            threads=torch.get_num_threads(),
+            threads=native_threads(),
         )
         learning.append(count)
         ctx.save_for_backward(*gradients)

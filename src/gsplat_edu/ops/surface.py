@@ -15,7 +15,7 @@ from torch import Tensor
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import chained, first_derivative_only
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.threads import one_thread
+from gsplat_edu.base.threads import native_threads, one_thread
 from gsplat_edu.base.validation import check_shape, in_range
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.ops.lenses import native_rays
@@ -190,7 +190,7 @@ class _NormalError(torch.autograd.Function):
             **(_pinhole(camera) if camera.pinhole else native_rays(camera, normals.dtype)),
             scale=weight / (camera.H * camera.W),
             jump=JUMP,
-            threads=torch.get_num_threads(),
+            threads=native_threads(),
         )
         ctx.save_for_backward(*gradients)
         return normals.new_tensor(value)

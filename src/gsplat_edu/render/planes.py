@@ -24,6 +24,7 @@ from torch import Tensor
 
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import first_derivative_only
+from gsplat_edu.base.threads import native_threads
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native_array
 from gsplat_edu.render.torch.sight import seen_by
 from gsplat_edu.scene.camera import Camera, CameraLike, as_camera
@@ -200,5 +201,5 @@ def _arguments(given: Sequence[Tensor], eye: np.ndarray) -> dict[str, Any]:
         "quats": quats,
         "log_scales": log_scales,
         "eye": eye.tolist(),
-        "threads": torch.get_num_threads(),
+        "threads": native_threads(),
     }

@@ -22,6 +22,7 @@ from torch import Tensor
 from gsplat_edu.base.buffers import reusable_tensor
 from gsplat_edu.base.derivatives import first_derivative_only, opaque
 from gsplat_edu.base.errors import ArgumentError
+from gsplat_edu.base.threads import native_threads
 from gsplat_edu.ops.kernels import SUFFIXES, kernel, native, native_array
 from gsplat_edu.ops.lenses import native_camera
 from gsplat_edu.ops.moments import AdamInBackward, Moments
@@ -323,7 +324,7 @@ class _Rasterize(torch.autograd.Function):
                 pixel_stop=settings.stop == "pixel",
             ),
             needed=_array(call.needed),
-            threads=torch.get_num_threads(),
+            threads=native_threads(),
         )
         size: tuple[int, ...] = (camera.H, camera.W)
         shapes: tuple[tuple[int, ...], ...] = (
