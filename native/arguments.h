@@ -42,7 +42,7 @@ struct Shape {
     }
 };
 
-enum class Kind { F32, F64, U8, I64 };
+enum class Kind { F32, F64, U8, I32, I64 };
 
 template <class T>
 constexpr Kind KIND = std::is_same_v<T, float> ? Kind::F32 : Kind::F64;
@@ -55,6 +55,8 @@ inline nb::dlpack::dtype dtype_of(Kind kind) {
             return nb::dtype<double>();
         case Kind::U8:
             return nb::dtype<uint8_t>();
+        case Kind::I32:
+            return nb::dtype<int32_t>();
         default:
             return nb::dtype<int64_t>();
     }

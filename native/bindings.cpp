@@ -15,7 +15,9 @@
 #include <utility>
 #include <vector>
 
+#include "bindings_screen.h"
 #include "bindings_surface.h"
+#include "bindings_surfels.h"
 #include "bindings_volume.h"
 #include "buffers.h"
 #include "dispatch.h"
@@ -448,7 +450,9 @@ NB_MODULE(_native, m) {
     m.def("recolor_backward_f64", &recolor_backward<double>);
     m.def("loss_f32", &loss_of<float>);
     m.def("loss_f64", &loss_of<double>);
+    bind_screen(m);
     bind_surface(m);
+    bind_surfels(m);
     m.def("ask_before_large_blocks", [](const nb::object &function) {
         free_memory_function = function.inc_ref().ptr();
         ask_before_large_blocks(&free_memory);

@@ -38,7 +38,7 @@ Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &set
     grid_.tiles_x = (camera.W + TILE - 1) / TILE, grid_.tiles_y = (camera.H + TILE - 1) / TILE;
     if (scene.n >= (int64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 Gaussians");
     project(scene);
-    sort();
+    sort(scene.order);
     intersect(needed);
 }
 
@@ -58,7 +58,7 @@ void Frame<T>::project(const Scene<T> &scene) {
 }
 
 template <class T>
-void Frame<T>::sort() {
+void Frame<T>::sort(const T *order) {
     Timer timer(stages_[1]);
     const size_t count = size_t(visible_count_) + 1;
     Buffer key_buffer;
@@ -69,7 +69,7 @@ void Frame<T>::sort() {
         const uint32_t *from = block_ids_.as<uint32_t>() + block * BLOCK;
         for (uint32_t k = begin[block]; k < begin[block + 1]; ++k) {
             ids[k] = keys[k].id = *from++;
-            std::memcpy(&keys[k].key, &splats()[ids[k]].depth, sizeof(T));
+            std::memcpy(&keys[k].key, order ? order + ids[k] : &splats()[ids[k]].depth, sizeof(T));
         }
     });
     sort_by_depth(threads_, visible_count_, keys, static_cast<uint32_t *>(sorted_.reserve(count * 4)));

@@ -59,7 +59,7 @@ class Frame {
   private:
     const Splat<T> *splats() const { return splats_.as<Splat<T>>(); }
     void project(const Scene<T> &scene);
-    void sort();
+    void sort(const T *order);
     void intersect(const uint8_t *needed);
     const uint32_t *find_drawn(const uint8_t *needed, Buffer &buffer) const;
     CompositeArgs<T> composite_args(const Images<T> &out, const T *features) const;

@@ -21,6 +21,13 @@ template <class T> void surface_tangents(const SurfaceArgs<T> &, int64_t row);
 template <class T> void surface_gradient(const SurfaceArgs<T> &, int64_t row);
 template <class T> void normals(const NormalArgs<T> &, int64_t block);
 template <class T> void normals_backward(const NormalArgs<T> &, int64_t block);
+template <class T> void screen(const ScreenArgs<T> &, int64_t block);
+template <class T> void screen_backward(const ScreenArgs<T> &, int64_t block);
+template <class T> void radii(const RadiusArgs<T> &, int64_t begin, int64_t end);
+template <class T> void harmonic_colors(const HarmonicArgs<T> &, int64_t block);
+template <class T> void harmonic_colors_backward(const HarmonicArgs<T> &, int64_t block);
+template <class T> void surfels(const SurfelArgs<T> &, int64_t tile, T *scratch);
+template <class T> void surfels_backward(const SurfelArgs<T> &, int64_t tile, T *scratch);
 template <class T> void adam(const AdamArgs<T> &, int64_t begin, int64_t end);
 template <class T> void adam_backward(const AdamBackwardArgs<T> &, int64_t block, T *scratch);
 

@@ -71,6 +71,7 @@ struct Scene {
     int32_t rest;                                      // coefficients per channel in sh_rest
     const double *cov3ds;                              // N 3 3; in float the determinants of thin ones would lose their digits
     const T *colors, *opacities;                       // N 3, N
+    const T *order;                                    // N, not negative, what to sort by instead of the depth; or null
 };
 
 // Gradients of the scene; every entry of a range is written, including zeros.
@@ -316,6 +317,71 @@ struct SurfaceArgs {
     double *sums;  // H: the loss of each row
 };
 
+// Gaussians on the screen of a pinhole, as screen.cpp projects them; all but the scene is double.
+constexpr int SCREEN_CAMERA = 16;                      // the matrix row by row, fx, fy, cx, cy
+
+template <class T>
+struct ScreenArgs {
+    int64_t n;
+    const T *means, *quats, *scales;                   // n 3, n 4, n 3
+    const T *covars;                                   // n 6, upper triangles, instead of quats and scales
+    double viewmat[12], K[4], size[2];                 // world to camera, 3 x 4; fx, fy, cx, cy; width and height
+    double margin, z_near, z_far, eps2d;
+    double *centres, *depths, *conics, *compensations, *spreads;  // n 2, n, n 3, n, n 3
+    uint8_t *drawable;                                 // n, between near and far, and not too thin
+    const double *grad_centres, *grad_depths, *grad_conics, *grad_compensations, *grad_spreads;  // backward only; null for 0
+    T *grad_means, *grad_quats, *grad_scales, *grad_covars;  // to which the gradients are added
+    double *camera_sums;                               // blocks x SCREEN_CAMERA
+};
+
+// Half sizes of the boxes around what is on the screen, px, rounded up; 0 for what is not drawn.
+template <class T>
+struct RadiusArgs {
+    int64_t n;
+    const double *centres, *spreads;                   // n 2, n 3
+    const uint8_t *drawable;                           // n
+    const T *opacities;                                // n; null for radii that suit every opacity
+    const double *compensations;                       // n, factors of the opacities; null for 1
+    double size[2], eps2d, extent, radius_clip;        // extent: the largest half size, standard deviations
+    int32_t *radii;                                    // n 2
+};
+
+// Colours of harmonics without offset and floor, in directions of any length.
+template <class T>
+struct HarmonicArgs {
+    int64_t n, rows, stored;                           // directions; rows of coefficients, and how many each has
+    int32_t degree;
+    const T *directions, *coefficients;                // n 3, rows stored 3
+    const int64_t *row_of, *index_of;                  // n, no row twice; rows, the direction of each, or -1
+    T *colors;                                         // n 3
+    const T *grad_colors;                              // n 3, only in the backward pass
+    T *grad_directions, *grad_coefficients;            // as their primals
+    bool overwrites;                                   // whether the coefficients' gradients replace what was there
+    int used() const { return (degree + 1) * (degree + 1); }
+};
+
+// Numbers of a surfel's record: the lines A, B and C, the centre less the reference point, the opacity, the reference point. In a
+// slot of gradients, the last two are sums of the absolute values of the centre's gradient.
+enum Surfel { LINES, CENTRE = 9, OPACITY = 11, REFERENCE = 12, SURFEL = 14 };
+
+// 2D Gaussians of several images and their lists of tiles, image after image and row by row; surfels.cpp has the formulas.
+template <class T>
+struct SurfelArgs {
+    const T *records, *channels;                       // M SURFEL, M count
+    int64_t count, depth;                              // number of channels; which one distortion and median are of
+    const int64_t *tile_begin, *rows;                  // tiles + 1; rows of the records, each tile's near to far
+    int64_t H, W, edge, tiles_x, tiles_y;              // of one image, px and tiles
+    T *image, *transmittance, *distortion, *median;    // images H W count, and images H W
+    int64_t *median_places, *done;                     // images H W: place in the tile's list, -1 for none; tiles: pairs composited
+    const T *grad_image, *grad_transmittance, *grad_distortion, *grad_median;  // the rest is for the backward pass only
+    const int64_t *slot_of;                            // pairs
+    T *slots;                                          // pairs (SURFEL + count)
+
+    int64_t stride() const { return ((edge < W ? edge : W) + 15) / 16 * 16; }  // a multiple of every vector width
+    int64_t plane() const { return stride() * (edge < H ? edge : H); }         // numbers of a tile's plane
+    int64_t scratch() const { return (count + 12) * plane(); }                 // numbers that a thread needs
+};
+
 constexpr int64_t BLOCK = 256;  // Gaussians per task
 
 // The kernels of one instruction set and scalar type.
@@ -338,6 +404,13 @@ struct Kernels {
     void (*surface_gradient)(const SurfaceArgs<T> &, int64_t row);
     void (*normals)(const NormalArgs<T> &, int64_t block);
     void (*normals_backward)(const NormalArgs<T> &, int64_t block);
+    void (*screen)(const ScreenArgs<T> &, int64_t block);
+    void (*screen_backward)(const ScreenArgs<T> &, int64_t block);
+    void (*radii)(const RadiusArgs<T> &, int64_t begin, int64_t end);
+    void (*harmonic_colors)(const HarmonicArgs<T> &, int64_t block);
+    void (*harmonic_colors_backward)(const HarmonicArgs<T> &, int64_t block);
+    void (*surfels)(const SurfelArgs<T> &, int64_t tile, T *scratch);
+    void (*surfels_backward)(const SurfelArgs<T> &, int64_t tile, T *scratch);
     int64_t rows_bytes;  // of a batch, in CompositeArgs::rows; 0 if none are kept
 };
 

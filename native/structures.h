@@ -109,7 +109,12 @@ struct PerGaussian {
 };
 
 struct SceneArrays : PerGaussian {
-    explicit SceneArrays(Arguments a) : PerGaussian(a, false) { a.finish(); }
+    Array order;
+
+    explicit SceneArrays(Arguments a) : PerGaussian(a, false) {
+        if (a.has("order")) order = a.array("order", {means.is(Kind::F32) ? Kind::F32 : Kind::F64}, {n});
+        a.finish();
+    }
 
     template <class T>
     Scene<T> as() const {
@@ -123,7 +128,8 @@ struct SceneArrays : PerGaussian {
                 int32_t(rest),
                 cov3ds.as<double>(),
                 colors.as<T>(),
-                opacities.as<T>()};
+                opacities.as<T>(),
+                order.as<T>()};
     }
 };
 

@@ -28,6 +28,13 @@ static constexpr Kernels<T> kernels() {
             surface_gradient<T>,
             normals<T>,
             normals_backward<T>,
+            screen<T>,
+            screen_backward<T>,
+            radii<T>,
+            harmonic_colors<T>,
+            harmonic_colors_backward<T>,
+            surfels<T>,
+            surfels_backward<T>,
             KEEPS_ROWS ? int64_t(sizeof(KeptRows<T>)) : 0};
 }
 

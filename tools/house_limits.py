@@ -31,6 +31,9 @@ EXCEPTIONS = {
     "src/gsplat_edu/compat/tiles.py:isect_tiles": "gsplat's signature",
     "src/gsplat_edu/compat/tiles.py:rasterize_to_pixels": "gsplat's signature",
     "src/gsplat_edu/compat/projection.py:fully_fused_projection": "gsplat's signature",
+    "src/gsplat_edu/compat/surfels.py:fully_fused_projection_2dgs": "gsplat's signature",
+    "src/gsplat_edu/compat/surfels.py:rasterization_2dgs": "gsplat's signature",
+    "src/gsplat_edu/compat/surfel_images.py:rasterize_to_pixels_2dgs": "gsplat's signature",
 }
 """Functions that may have more parameters, with the reason."""
 

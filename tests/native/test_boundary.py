@@ -122,6 +122,32 @@ def loss(**changes):
     return _native.loss_f32(**fields | {"ssim_weight": 0.2, "threads": 2} | changes)
 
 
+def surfel_arrays():
+    """Return the arrays of N records without an area, each in all four tiles of an image."""
+    plane = {name: torch.zeros(1, H, W) for name in ("transmittance", "distortion", "median")}
+    return plane | {
+        "records": torch.ones(N, 14),
+        "channels": torch.ones(N, 4),
+        "tile_begin": torch.arange(5) * N,
+        "rows": torch.arange(N).repeat(4),
+        "image": torch.zeros(1, H, W, 4),
+        "median_places": torch.full((1, H, W), -1),
+        "done": torch.full((4,), N),
+    }
+
+
+def surfels(**changes):
+    numbers = {"depth": 0, "edge": 4, "tiles_x": 2, "tiles_y": 2, "threads": 2}
+    _native.surfels_f32(**surfel_arrays() | numbers | changes)
+
+
+def surfels_backward(**changes):
+    fields = {f"grad_{name}": torch.zeros(1, H, W) for name in ("transmittance", "distortion", "median")}
+    fields |= {"grad_image": torch.zeros(1, H, W, 4), "out": torch.empty(N, 18)}
+    numbers = {"depth": 0, "edge": 4, "tiles_x": 2, "tiles_y": 2, "threads": 2}
+    _native.surfels_backward_f32(**surfel_arrays() | numbers | fields | changes)
+
+
 CALLS = {
     camera: ("R", "eye", "fx", "fy", "cx", "cy", "x_bounds", "y_bounds", "H", "W"),
     settings: ("z_near", "background", "sh_degree", "antialiased", "alpha_max", "pixel_stop"),
@@ -139,6 +165,11 @@ CALLS = {
     noise: (
         *("means", "quats", "log_scales", "logit_opacities"),
         *("seed", "amount", "sharpness", "threshold", "threads"),
+    ),
+    surfels: (*surfel_arrays(), "depth", "edge", "tiles_x", "tiles_y", "threads"),
+    surfels_backward: (
+        *surfel_arrays(),
+        *("grad_image", "grad_transmittance", "grad_distortion", "grad_median", "out", "depth", "threads"),
     ),
 }
 EVERY = [(call, name) for call, names in CALLS.items() for name in names]
@@ -240,6 +271,29 @@ def test_an_unsuitable_array_is_refused(call, name, wrong):
     leads = name in ("means", "parameter", "image") and wrong in ("empty", "one more", "flat", "nine axes")
     with pytest.raises(ValueError, match=r": \w+: has to be" if leads else rf": {name}: has to be"):
         call(**{name: WRONG[wrong](given)})
+
+
+LISTS = {
+    "tile_begin": (
+        [0, 5, 10, 15, 21],
+        [0, 5, 4, 15, 20],
+        [1, 5, 10, 15, 20],
+        [0, 10, 20],
+        [-5, 5, 10, 15, 20],
+    ),
+    "rows": ([N] * 20, [-1] * 20),
+    "done": ([0, 0, 0, 6], [-1, 0, 0, 0]),
+}
+
+
+@pytest.mark.parametrize("name", LISTS)
+def test_lists_that_lead_outside_the_arrays_are_refused(name):
+    for wrong in LISTS[name]:
+        with pytest.raises(ValueError, match=f"^surfels_backward: {name}: "):
+            surfels_backward(**{name: torch.tensor(wrong)})
+        if name != "done":  # it is written by the forward pass
+            with pytest.raises(ValueError, match=f"^surfels: {name}: "):
+                surfels(**{name: torch.tensor(wrong)})
 
 
 def test_numpy_arrays_are_accepted_and_read_only_ones_only_as_inputs():

@@ -13,7 +13,9 @@ ISA_FREE = {
         f"{name}.{end}"
         for name in (
             *(
+                "bindings_screen",
                 "bindings_surface",
+                "bindings_surfels",
                 "bindings_volume",
                 "buffers",
                 "dispatch",

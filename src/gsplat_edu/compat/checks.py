@@ -393,17 +393,19 @@ def check_cameras(viewmats: Tensor, Ks: Tensor, batch: tuple[int, ...], means: T
     return C
 
 
-def check_spreads(name: str, spreads: Tensor, positions: Tensor, batch: tuple[int, ...]) -> None:
+def check_spreads(
+    name: str, spreads: Tensor, positions: Tensor, sizes: tuple[tuple[int, ...], int, int]
+) -> None:
     """Check that no drawn Gaussian is larger on the screen than the kernels can hold; `name` made the covariances.
 
     Args:
         name: The argument to name.
-        spreads: (B, C, N, 3) xx, xy and yy of the screen covariances, px².
-        positions: Positions of the drawn ones in (B, C, N).
-        batch: Leading axes of the argument.
+        spreads: (nnz, 3) xx, xy and yy of the screen covariances of the drawn ones, px².
+        positions: (nnz,) their positions in (B, C, N).
+        sizes: Leading axes of the argument, C and N.
     """
-    C, N = spreads.shape[1:3]
-    wide = spreads.detach().reshape(-1, 3)[positions][:, [0, 2]].sum(dim=-1) > 0.5 * SPLAT_LIMIT**2
+    batch, C, N = sizes
+    wide = spreads.detach()[:, 0] + spreads.detach()[:, 2] > 0.5 * SPLAT_LIMIT**2
     if bool(wide.any()):
         at = int(positions[wide.nonzero()[0, 0]])
         where = (*np.unravel_index(at // (C * N), batch), at % N) if batch else (at % N,)

@@ -1,4 +1,4 @@
-"""A drop-in for gsplat 1.5.3: its `rasterization`, and the steps it is made of, on any CPU.
+"""A drop-in for gsplat 1.5.3: `rasterization`, `rasterization_2dgs` and the steps they are made of, on any CPU.
 
 `rasterization` also has the nine arguments that gsplat's main branch has added since. There they stand between those of
 1.5.3; here they are keywords only, so that positional calls written for 1.5.3 keep their meaning.
@@ -11,35 +11,38 @@ one and lists the differences.
 
 Design. gsplat has three stages, each differentiable: projection and harmonics, then compositing of what they return.
 Its strategies call `meta["means2d"].retain_grad()` before the backward pass and read `.grad` and `.absgrad` after it.
-So the stages here are the same. Projection and harmonics are torch operations (projection.py, harmonics.py);
-`meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are nodes of the graph between them and the image.
-Compositing is our native kernels (images.py), whose gradient with respect to a mean on the screen arrives at
-`meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad, hooks and losses on these tensors work
-without special cases. `absgrad` is a statistic that the kernels collect; a hook on their input stores it as an
-attribute after each backward pass.
+So the stages here are the same. Projection and harmonics are native steps of the graph (screen.py), or torch operations
+for lenses, degree 4 and other than three channels; `meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are
+nodes of the graph between them and the image. Compositing is our native kernels (images.py), whose gradient with
+respect to a mean on the screen arrives at `meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad,
+hooks and losses on these tensors work without special cases. `absgrad` is a statistic that the kernels collect; a hook
+on their input stores it as an attribute after each backward pass.
 
-The renderer's own projection is not used: it computes in double without temporary arrays, but returns no centres that a
-graph could pass through. Training with `gsplat_edu.render.api.render` is faster.
+The renderer's own projection is not used: it returns no centres that a graph could pass through. Compositing projects
+what is on the screen once more, which `gsplat_edu.render.api.render` need not do.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.constants import SH_OFFSET
 from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
+from gsplat_edu.compat.drawn import Drawn, colors_of, directions, drawn_at, joined
 from gsplat_edu.compat.harmonics import evaluate, spherical_harmonics
 from gsplat_edu.compat.images import Splats, absgrad_store, composite
 from gsplat_edu.compat.lenses import cameras_of
 from gsplat_edu.compat.parts import compute_relocation, proj, quat_scale_to_covar_preci, world_to_cam
 from gsplat_edu.compat.projection import TRIANGLE, Lens, fully_fused_projection, project, solids_of
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
+from gsplat_edu.compat.surfel_images import rasterize_to_pixels_2dgs
+from gsplat_edu.compat.surfels import fully_fused_projection_2dgs, rasterization_2dgs
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
 from gsplat_edu.render.api import BYTES_PER_PIXEL
 
@@ -47,12 +50,15 @@ __all__ = [
     "RollingShutterType",
     "compute_relocation",
     "fully_fused_projection",
+    "fully_fused_projection_2dgs",
     "isect_offset_encode",
     "isect_tiles",
     "proj",
     "quat_scale_to_covar_preci",
     "rasterization",
+    "rasterization_2dgs",
     "rasterize_to_pixels",
+    "rasterize_to_pixels_2dgs",
     "skipping_bad_gaussians",
     "spherical_harmonics",
     "world_to_cam",
@@ -124,15 +130,6 @@ def rasterization(
     return _rasterize(Arguments(**without_bad_gaussians(dict(locals()))))
 
 
-class _Drawn(NamedTuple):
-    """The Gaussians with positive radii, by image."""
-
-    positions: Int64[Tensor, " nnz"]  # in the arrays (B C N)
-    scenes: Int64[Tensor, " nnz"]
-    images: Int64[Tensor, " nnz"]  # batch times C plus camera
-    gaussians: Int64[Tensor, " nnz"]
-
-
 def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     require_memory(
         f"{a.batches * a.C} images of {a.width}x{a.height} px",
@@ -146,9 +143,9 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     solids = solids_of(a.means, triangle, a.quats, a.scales)
     found = project(solids, viewmats, Ks, lens, flat, antialiased, model)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
-    check_spreads("scales" if a.covars is None else "covars", found.spreads, positions, a.batch)
-    images = positions // max(a.N, 1)
-    drawn = _Drawn(positions, images // a.C, images, positions % max(a.N, 1))
+    spreads = joined(found.spreads, 3).index_select(0, positions)
+    check_spreads("scales" if a.covars is None else "covars", spreads, positions, (a.batch, a.C, a.N))
+    drawn = drawn_at(positions, a)
     opacities = flat[:, None].expand(-1, a.C, -1)
     if antialiased:
         opacities = opacities * found.compensations
@@ -161,17 +158,15 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     }
     meta: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
     if a.packed:
-        meta = {"batch_ids": drawn.scenes, "camera_ids": images % a.C, "gaussian_ids": drawn.gaussians}
-        meta |= {name: _rows(field, 3).index_select(0, positions) for name, field in fields.items()}
-        rows = torch.arange(len(positions))
+        meta = {"batch_ids": drawn.scenes, "camera_ids": drawn.images % a.C, "gaussian_ids": drawn.gaussians}
+        meta |= {name: joined(field, 3).index_select(0, positions) for name, field in fields.items()}
     else:
         meta |= {name: field.view(*a.batch, a.C, a.N, *field.shape[3:]) for name, field in fields.items()}
-        rows = positions
     meta |= {name: getattr(a, name) for name in ("width", "height", "tile_size")}
     meta |= {"n_batches": a.batches, "n_cameras": a.C}
     for name, size in (("tile_width", a.width), ("tile_height", a.height)):
         meta[name] = math.ceil(size / a.tile_size)
-    views = _draw(a, lens, drawn, (rows, found.spreads), meta)
+    views = _draw(a, lens, drawn, spreads, meta)
     image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
     alphas = 1.0 - transmittance[..., None]
     if a.extra_signals is not None:
@@ -184,73 +179,49 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     return image, alphas, meta
 
 
-def _rows(tensor: Tensor, axes: int) -> Tensor:
-    """Join the leading axes."""
-    return tensor.reshape(math.prod(tensor.shape[:axes]), *tensor.shape[axes:])
-
-
 def _draw(
     a: Arguments,
     lens: Lens,
-    drawn: _Drawn,
-    inputs: tuple[Int64[Tensor, " nnz"], Float[Tensor, "B C N 3"]],
+    drawn: Drawn,
+    spreads: Float[Tensor, "nnz 3"],
     meta: dict[str, Any],
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Draw every image; `inputs` are the rows of the drawn Gaussians in the tensors of `meta`, and spreads."""
-    rows, spreads = inputs
-    axes = 1 if a.packed else len(a.batch) + 2
-    means2d, depths, opacities = (_rows(meta[name], axes) for name in ("means2d", "depths", "opacities"))
+    """Draw every image, given the spreads of the drawn Gaussians."""
+    own = [meta[name] for name in ("means2d", "depths", "opacities")]
+    rows = torch.arange(len(spreads)) if a.packed else drawn.positions  # in the tensors of `meta`
+    if not a.packed:
+        own = [joined(each, len(a.batch) + 2).index_select(0, rows) for each in own]
+    means2d, depths, opacities = own
     with_depth = a.render_mode != "RGB"
-    colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else _colors(a, a.colors, drawn)
+    colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else colors_of(a, a.colors, drawn)
     signals = None if a.extra_signals is None else _extra_signals(a, a.extra_signals, drawn)
-    backgrounds = None if a.backgrounds is None else _rows(a.backgrounds, len(a.batch) + 1)
+    backgrounds = None if a.backgrounds is None else joined(a.backgrounds, len(a.batch) + 1)
     if colors is None and signals is None:
         backgrounds = None  # a depth has no background
-    ends = torch.bincount(drawn.images, minlength=a.batches * a.C).cumsum(0).tolist()
     images, transmittances = [], []
-    for k, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        # Near to far; ties in the order of the Gaussians.
-        order = begin + torch.argsort(depths.detach()[rows[begin:end]], stable=True)
-        own = rows[order]
+    for k, (begin, end) in enumerate(zip([0, *drawn.ends], drawn.ends, strict=False)):
+        part = slice(begin, end)
         splats = Splats(
-            means2d.index_select(0, own),
-            _rows(spreads, 3).index_select(0, drawn.positions[order]),
-            opacities.index_select(0, own),
-            None if colors is None else colors.index_select(0, order),
-            depths.index_select(0, own) if with_depth else None,
+            means2d[part],
+            spreads[part],
+            opacities[part],
+            None if colors is None else colors[part],
+            depths[part] if with_depth else None,
             None if backgrounds is None else backgrounds[k],
-            None if signals is None else signals.index_select(0, order),
+            None if signals is None else signals[part],
+            order=depths.detach()[part] + 0.0,  # not -0
         )
-        store = absgrad_store(meta["means2d"], own) if a.absgrad else None
+        store = absgrad_store(meta["means2d"], rows[part]) if a.absgrad else None
         image, transmittance = composite(splats, lens, store)
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances
 
 
-def _colors(a: Arguments, colors: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz D"]:
-    """Return the colours of the drawn Gaussians, from the harmonics if there are any."""
-    row = (drawn.images if a.colors_per_camera else drawn.scenes) * a.N + drawn.gaussians
-    if a.sh_degree is None:
-        return _rows(colors, colors.ndim - 1).index_select(0, row)
-    coefficients = _rows(colors, colors.ndim - 2).index_select(0, row)
-    return torch.clamp_min(evaluate(a.sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET, 0.0)
-
-
-def _extra_signals(a: Arguments, signals: Tensor, drawn: _Drawn) -> Float[Tensor, "nnz E"]:
+def _extra_signals(a: Arguments, signals: Tensor, drawn: Drawn) -> Float[Tensor, "nnz E"]:
     """Return the extra signals of the drawn Gaussians; gsplat offsets those of harmonics, but has no floor."""
     if a.extra_signals_sh_degree is None:
         row = (drawn.images if a.extra_signals_per_camera else drawn.scenes) * a.N + drawn.gaussians
-        return _rows(signals, signals.ndim - 1).index_select(0, row)
-    coefficients = signals.index_select(0, drawn.gaussians)
-    return evaluate(a.extra_signals_sh_degree, _directions(a, drawn), coefficients) + SH_OFFSET
-
-
-def _directions(a: Arguments, drawn: _Drawn) -> Float[Tensor, "nnz 3"]:
-    """Return the vectors from the cameras to the drawn Gaussians."""
-    eyes = torch.inverse(a.viewmats)[..., :3, 3]
-    if a.viewmats_rs is not None:
-        eyes = 0.5 * (eyes + torch.inverse(a.viewmats_rs)[..., :3, 3])
-    eyes = eyes.reshape(-1, 3)
-    means = _rows(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
-    return means - eyes.index_select(0, drawn.images)
+        return joined(signals, signals.ndim - 1).index_select(0, row)
+    rows = (drawn.gaussians, drawn.ends)
+    return evaluate(a.extra_signals_sh_degree, directions(a, drawn), signals, rows) + SH_OFFSET

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.validation import whole_number
 from gsplat_edu.compat.checks import MOST_DEGREE
+from gsplat_edu.compat.screen import harmonic_colors
 from gsplat_edu.scene.gaussians import check_tensor
 from gsplat_edu.scene.sh import basis_terms
 
@@ -64,14 +65,29 @@ def spherical_harmonics(
             raise ArgumentError(f"masks: is {masks.dtype}, but has to be torch.bool")
         if masks.shape != batch:
             raise ShapeError(f"masks: has shape {tuple(masks.shape)}, but has to be {tuple(batch)}")
-    colors = evaluate(degree, dirs, coeffs)
+    rows = torch.arange(math.prod(batch))
+    flat = evaluate(degree, dirs.reshape(-1, 3), coeffs.reshape(-1, *coeffs.shape[-2:]), (rows, [len(rows)]))
+    colors = flat.view(*batch, 3)
     return colors if masks is None else torch.where(masks[..., None], colors, 0.0)
 
 
 def evaluate(
-    degree: int, dirs: Float[Tensor, "*B 3"], coeffs: Float[Tensor, "*B K D"]
-) -> Float[Tensor, "*B D"]:
-    """Evaluate harmonics of any number of channels without checks; see `spherical_harmonics`."""
+    degree: int,
+    dirs: Float[Tensor, "M 3"],
+    coeffs: Float[Tensor, "R K D"],
+    rows: tuple[Int64[Tensor, " M"], Sequence[int]],
+) -> Float[Tensor, "M D"]:
+    """Evaluate harmonics of any number of channels without checks; see `spherical_harmonics`.
+
+    Args:
+        degree: Highest degree to use.
+        dirs: Directions.
+        coeffs: Coefficients.
+        rows: The row of the coefficients for each direction, and where the rows of each image end.
+    """
+    if degree < MOST_DEGREE and coeffs.shape[-1] == 3 and coeffs.dtype == dirs.dtype:
+        return harmonic_colors(degree, dirs, coeffs, *rows)
+    coeffs = coeffs.index_select(0, rows[0])
     unit = torch.nn.functional.normalize(dirs, dim=-1)
     first, *others = basis_terms(min(degree, 3), *unit.unbind(-1))
     others += _fourth_degree(*unit.unbind(-1)) if degree == MOST_DEGREE else []

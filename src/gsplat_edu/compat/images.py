@@ -3,8 +3,8 @@
 The kernels project in three dimensions. A camera at the origin with focal length 1 leaves a Gaussian as it is whose
 mean is (u, v, 1) and whose covariance is the screen covariance, with zeros in the third row and column: x/z = u, and
 J W Sigma W' J' is the covariance itself, exactly. What autograd returns for that mean and covariance are the
-gradients of the centre and the screen covariance. The order near to far is the order of the rows, because all depths
-are equal.
+gradients of the centre and the screen covariance. All depths are equal, so the order near to far is that of the rows,
+unless depths to sort by are given.
 
 gsplat's pixels are sampled at their centres, (0.5, 0.5) for the first, ours at (0, 0): the means move by -0.5 px.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 from gsplat_edu.base.constants import COLOR_LIMIT
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.compat.projection import Lens
-from gsplat_edu.render.cpu.render import render_covariances
+from gsplat_edu.render.cpu.render import render_on_screen
 from gsplat_edu.render.output import RenderOutput
 from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.camera import Camera
@@ -36,7 +36,7 @@ COLOR_CHANNELS = 3
 
 
 class Splats(NamedTuple):
-    """M Gaussians of one image, near to far."""
+    """M Gaussians of one image."""
 
     means2d: Float[Tensor, "M 2"]
     """px, gsplat's pixel centres."""
@@ -47,6 +47,8 @@ class Splats(NamedTuple):
     depths: Float[Tensor, " M"] | None
     background: Float[Tensor, " D_plus_E"] | None
     extra_signals: Float[Tensor, "M E"] | None = None
+    order: Float[Tensor, " M"] | None = None
+    """Not negative, the nearest the smallest; None if the rows are near to far."""
 
 
 def composite(
@@ -91,19 +93,18 @@ def _render(
     """Composite up to three colours and the features over zero."""
     if front.numel() and float(front.detach().abs().amax()) > COLOR_LIMIT:
         raise ArgumentError(f"colors: exceed {COLOR_LIMIT:g}, beyond which the kernels skip a Gaussian")
-    u, v = (splats.means2d - 0.5).unbind(-1)
-    means = torch.stack([u, v, torch.ones_like(u)], dim=-1)
-    xx, xy, yy = splats.spreads.unbind(-1)
-    zero = torch.zeros_like(xx)
-    cov3ds = torch.stack([xx, xy, zero, xy, yy, zero, zero, zero, zero], dim=-1).view(-1, 3, 3)
-    view = render_covariances(
-        means,
-        cov3ds,
-        torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
-        splats.opacities,
+    means, cov3ds = _Raised.apply(splats.means2d, splats.spreads)  # type: ignore[no-untyped-call]
+    view = render_on_screen(
+        (
+            means,
+            cov3ds,
+            torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
+            splats.opacities,
+        ),
         Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
         dataclasses.replace(SETTINGS, dilation=lens.eps2d),
-        features=features if features.shape[1] else None,
+        features if features.shape[1] else None,
+        splats.order,
     )
     if absgrad is not None and means.requires_grad:
         found, visible = view.collect("absgrad"), view.visible
@@ -111,6 +112,23 @@ def _render(
         # the image: that would be a circle of references through the graph.
         means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))  # type: ignore[no-untyped-call]
     return view
+
+
+class _Raised(torch.autograd.Function):
+    """Means and covariances in space from those on the screen; autograd would take ten steps."""
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor, spreads: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
+        means, cov3ds = means2d.new_ones(len(means2d), 3), spreads.new_zeros(len(spreads), 9)
+        torch.sub(means2d, 0.5, out=means[:, :2])
+        cov3ds[:, :2], cov3ds[:, 3], cov3ds[:, 4] = spreads[:, :2], spreads[:, 1], spreads[:, 2]
+        return means, cov3ds.view(-1, 3, 3)
+
+    @staticmethod
+    def backward(ctx: Any, means: Tensor, cov3ds: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
+        spreads = cov3ds.reshape(-1, 9)[:, (0, 1, 4)]
+        spreads[:, 1] += cov3ds[:, 1, 0]
+        return means[:, :2].contiguous(), spreads
 
 
 def absgrad_store(means2d: Tensor, rows: Int64[Tensor, " M"]) -> Callable[[Tensor, Tensor], None]:

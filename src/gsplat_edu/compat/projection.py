@@ -1,10 +1,11 @@
-"""gsplat's projection in torch: centres, depths, conics and radii of all Gaussians in all cameras.
+"""gsplat's projection: centres, depths, conics and radii of all Gaussians in all cameras.
 
     p = R x + t,   u = fx px/pz + cx,   Sigma2d = J R Sigma R' J' + eps2d I,   compensation = sqrt(det0 / det)
 
-These are the formulas of the pinhole; `gsplat_edu.compat.lenses` has other lenses and rolling shutters. R and t come
-from the viewmat as any matrix, so that its gradient has all entries. det0, the determinant before eps2d, is the squared
-length of a cross product where quaternions and scales are known: a c - b² would cancel for thin Gaussians.
+These are the formulas of the pinhole, which `native/screen.cpp` has; other lenses and rolling shutters are here, in
+torch, with `gsplat_edu.compat.lenses`. R and t come from the viewmat as any matrix, so that its gradient has all
+entries. det0, the determinant before eps2d, is the squared length of a cross product where quaternions and scales are
+known: a c - b² would cancel for thin Gaussians.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Float, Int32
 from torch import Tensor
 
-from gsplat_edu.base.constants import ALPHA_MIN, DET_FLOOR, THINNEST
+from gsplat_edu.base.constants import DET_FLOOR, THINNEST
 from gsplat_edu.base.validation import flag
 from gsplat_edu.compat.checks import (
     check_cameras,
@@ -27,7 +28,8 @@ from gsplat_edu.compat.checks import (
     expect,
 )
 from gsplat_edu.compat.lenses import KINDS_BY_MODEL, CameraModel, see
-from gsplat_edu.scene.gaussians import quat_to_R_t
+from gsplat_edu.compat.screen import Lens, OnScreen, Solids, box_radii, through_pinhole
+from gsplat_edu.scene.gaussians import check_lengths, unchecked_rotations
 
 MARGIN = 0.15
 """gsplat clamps x/z and y/z inside the Jacobian at the edge of the image, moved outwards by this fraction of its size.
@@ -44,26 +46,6 @@ PLAIN_MODEL = CameraModel()
 """gsplat's pinhole."""
 
 
-class Lens(NamedTuple):
-    """Size of the image, px, and which Gaussians count."""
-
-    width: int
-    height: int
-    eps2d: float
-    near: float
-    far: float
-    radius_clip: float
-
-
-class Solids(NamedTuple):
-    """Gaussians of B batches: covariances, or the rotations and scales that make them."""
-
-    means: Float[Tensor, "B N 3"]
-    covars: Float[Tensor, "B N 6"] | None = None
-    rotations: Float[Tensor, "B N 3 3"] | None = None
-    scales: Float[Tensor, "B N 3"] | None = None
-
-
 class Projected(NamedTuple):
     """N Gaussians of B batches in C cameras each. Where a radius is 0, the other entries mean nothing."""
 
@@ -77,7 +59,7 @@ class Projected(NamedTuple):
 
 
 def solids_of(means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> Solids:
-    """Join the leading axes to one, and turn quaternions to rotations.
+    """Join the leading axes to one.
 
     Args:
         means: (..., N, 3) centres, world units.
@@ -90,8 +72,8 @@ def solids_of(means: Tensor, covars: Tensor | None, quats: Tensor | None, scales
         return Solids(means.reshape(*shape, 3), covars.reshape(*shape, 6))
     assert quats is not None
     assert scales is not None
-    rotations = quat_to_R_t(quats.reshape(-1, 4).double()).view(*shape, 3, 3)
-    return Solids(means.reshape(*shape, 3), None, rotations, scales.reshape(*shape, 3))
+    check_lengths(quats)
+    return Solids(means.reshape(*shape, 3), None, quats.reshape(*shape, 4), scales.reshape(*shape, 3))
 
 
 def project(
@@ -119,54 +101,43 @@ def project(
 
     Differentiable in: solids, viewmats, Ks, model.
     """
-    dtype = solids.means.dtype
-    solids = Solids(solids.means.double(), *(None if each is None else each.double() for each in solids[1:]))
-    viewmats, Ks = viewmats.double(), Ks.double()
-    opacities = None if opacities is None else opacities.double()
-    R = viewmats[..., None, :3, :3]
-    points = solids.means[:, None] @ viewmats[..., :3, :3].mT + viewmats[..., None, :3, 3]
-    depths = points[..., 2]
-    before = (depths >= lens.near) & (depths <= lens.far)
+    dtype, (viewmats, Ks) = solids.means.dtype, (viewmats.double(), Ks.double())
     if model.plain:
-        centre, rows = _through_pinhole(points, torch.where(before, depths, 1.0), R, Ks, lens)
+        found = through_pinhole(solids, viewmats, Ks, lens, MARGIN)
     else:
-        size = (lens.width, lens.height)
-        centre, jacobian, before = see(solids.means, viewmats, Ks, size, model, before)
-        rows = [jacobian[..., k, :] for k in (0, 1)]
-    a, b, c, det0 = _screen_covariances(solids, *rows)
-    variances = torch.stack([a, c], dim=-1) + lens.eps2d
-    det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
-    thick = det > THINNEST * variances.sum(dim=-1)  # others are not drawn
-    floor = torch.where(thick, det, 1.0)
-    compensations = torch.sqrt(det0.clamp(min=DET_FLOOR) / floor)
-    bright = None if opacities is None else opacities[:, None] * (compensations if compensated else 1.0)
-    return Projected(
-        _radii(centre, variances, before & thick, bright, lens),
-        centre.to(dtype),
-        depths.to(dtype),
-        torch.stack([variances[..., 1] / floor, -b / floor, variances[..., 0] / floor], dim=-1).to(dtype),
-        compensations.to(dtype),
-        torch.stack([a, b, c], dim=-1),
-    )
+        found = _through_lens(solids, viewmats, Ks, lens, model)
+    given = None if opacities is None else opacities[:, None].expand(found.depths.shape)
+    radii = box_radii(found, given, compensated, lens, EXTENT)
+    outputs = (found.centres, found.depths, found.conics, found.compensations)
+    return Projected(radii, *(each.to(dtype) for each in outputs), found.spreads)
 
 
-def _through_pinhole(
-    points: Float[Tensor, "B C N 3"],
-    z: Float[Tensor, "B C N"],
-    R: Float[Tensor, "B C 1 3 3"],
+def _through_lens(
+    solids: Solids,
+    viewmats: Float[Tensor, "B C 4 4"],
     Ks: Float[Tensor, "B C 3 3"],
     lens: Lens,
-) -> tuple[Float[Tensor, "B C N 2"], list[Float[Tensor, "B C N 3"]]]:
-    """Return the centres and the two rows of J R, with x/z and y/z clamped in J as by gsplat."""
-    focals, centers = [Ks[..., k, k, None] for k in (0, 1)], [Ks[..., k, 2, None] for k in (0, 1)]
-    centre, rows = [], []
-    for k, size in enumerate((lens.width, lens.height)):
-        ratio = points[..., k] / z
-        low, high = -MARGIN * size - centers[k], (1 + MARGIN) * size - centers[k]
-        clamped = torch.minimum(torch.maximum(ratio, low / focals[k]), high / focals[k])
-        centre.append(focals[k] * ratio + centers[k])
-        rows.append((focals[k] / z)[..., None] * (R[..., k, :] - clamped[..., None] * R[..., 2, :]))
-    return torch.stack(centre, dim=-1), rows
+    model: CameraModel,
+) -> OnScreen:
+    """Project through a lens or a rolling shutter, as `through_pinhole` does through a pinhole."""
+    solids = Solids(*(None if each is None else each.double() for each in solids))
+    R, t = viewmats[..., :3, :3], viewmats[..., None, :3, 3]
+    depths = (solids.means[:, None] @ R.mT + t)[..., 2]
+    before = (depths >= lens.near) & (depths <= lens.far)
+    centre, jacobian, before = see(solids.means, viewmats, Ks, (lens.width, lens.height), model, before)
+    a, b, c, det0 = _screen_covariances(solids, *(jacobian[..., k, :] for k in (0, 1)))
+    wide, high = a + lens.eps2d, c + lens.eps2d
+    det = det0 + lens.eps2d * (a + c) + lens.eps2d**2
+    thick = det > THINNEST * (wide + high)  # others are not drawn
+    floor = torch.where(thick, det, 1.0)
+    return OnScreen(
+        centre,
+        depths,
+        torch.stack([high / floor, -b / floor, wide / floor], dim=-1),
+        torch.sqrt(det0.clamp(min=DET_FLOOR) / floor),
+        torch.stack([a, b, c], dim=-1),
+        before & thick,
+    )
 
 
 def _screen_covariances(
@@ -180,38 +151,16 @@ def _screen_covariances(
         side0, side1 = (torch.einsum("bxnij,bcnj->bcni", Sigma, row) for row in (row0, row1))
         a, b, c = (row0 * side0).sum(-1), (row0 * side1).sum(-1), (row1 * side1).sum(-1)
         return a, b, c, a * c - b * b
-    assert solids.rotations is not None
+    assert solids.quats is not None
     assert solids.scales is not None
     s0, s1, s2 = solids.scales[:, None].unbind(-1)
-    turned = [torch.einsum("bcni,bnij->bcnj", row, solids.rotations) for row in (row0, row1)]
+    rotations = unchecked_rotations(solids.quats.reshape(-1, 4)).view(*solids.scales.shape, 3)
+    turned = [torch.einsum("bcni,bnij->bcnj", row, rotations) for row in (row0, row1)]
     normal = torch.linalg.cross(*turned) * torch.stack([s1 * s2, s2 * s0, s0 * s1], dim=-1)
     side0, side1 = (row * solids.scales[:, None] for row in turned)
     products = (side0 * side0, side0 * side1, side1 * side1, normal * normal)
     a, b, c, det0 = (product.sum(dim=-1) for product in products)
     return a, b, c, det0
-
-
-@torch.no_grad()
-def _radii(
-    means2d: Float[Tensor, "B C N 2"],
-    variances: Float[Tensor, "B C N 2"],
-    drawable: Bool[Tensor, "B C N"],
-    opacities: Float[Tensor, "B _ N"] | None,
-    lens: Lens,
-) -> Int32[Tensor, "B C N 2"]:
-    """Return the half sizes of the boxes, px, rounded up; 0 for Gaussians that are not drawn."""
-    extent: Tensor | float = EXTENT
-    if opacities is not None:
-        drawable = drawable & (opacities >= ALPHA_MIN)
-        extent = torch.sqrt(2.0 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)).clamp(max=EXTENT)[
-            ..., None
-        ]
-    radii = torch.ceil(extent * torch.sqrt(variances.clamp(min=0.0)))
-    size = means2d.new_tensor([lens.width, lens.height])
-    meets = ((means2d + radii > 0) & (means2d - radii < size)).all(dim=-1)
-    drawn = drawable & meets & (radii > lens.radius_clip).any(dim=-1)
-    most = float(2**31 - 128)  # exact in float32
-    return torch.where(drawn[..., None], radii.clamp(max=most), 0.0).to(torch.int32)
 
 
 def fully_fused_projection(

@@ -210,7 +210,7 @@ def rasterize_to_pixels(
 
     Differentiable in: means2d, conics, colors, opacities, backgrounds.
     """
-    return _composited(_Tiles(**_checked(**locals())))
+    return _composited(_Tiles(**checked_lists({"conics": (3,)}, **locals())))
 
 
 class _Tiles(NamedTuple):
@@ -282,8 +282,17 @@ def _covariances(conics: Tensor, rows: Tensor) -> Tensor:
     return torch.stack(parts, dim=-1)
 
 
-def _checked(**a: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Check the arguments of `rasterize_to_pixels`; return them with int64 lists."""
+def checked_lists(tails: dict[str, tuple[int, ...]], **a: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Check the arguments of a rasteriser by lists; return them with int64 lists.
+
+    Args:
+        tails: Last axes of the arguments that only this rasteriser has, which begin with those of `means2d`.
+        a: The arguments.
+
+    Raises:
+        ShapeError: a shape differs.
+        ArgumentError: a value is not finite or out of range.
+    """
     means2d, packed = real_tensor("means2d", a["means2d"]), flag("packed", a["packed"])
     flag("absgrad", a["absgrad"])
     check_size(a["image_width"], a["image_height"], "image_width", "image_height")
@@ -292,7 +301,7 @@ def _checked(**a: Any) -> dict[str, Any]:  # noqa: ANN401
     expect("means2d", means2d, (*leading, 2), means2d)
     check_tensor("colors", a["colors"], ("...",), {})
     D = a["colors"].shape[-1] if a["colors"].ndim else 0
-    for name, tail in (("conics", (3,)), ("colors", (max(D, 1),)), ("opacities", ())):
+    for name, tail in (tails | {"colors": (max(D, 1),), "opacities": ()}).items():
         expect(name, a[name], (*leading, *tail), means2d, "means2d")
     offsets, rows = (whole_numbers(name, a[name]) for name in ("isect_offsets", "flatten_ids"))
     images = tuple(offsets.shape[:-2]) if packed else leading[:-1]

@@ -109,7 +109,7 @@ class Gaussians:
             raise ShapeError(
                 f"colors: holds {sizes['K']} coefficients per channel, but degrees 0-3 have 1, 4, 9, 16"
             )
-        _check_lengths(quats)
+        check_lengths(quats)
         _check_entries("scales", scales, scales > 0, "above 0")
         _check_entries("opacities", opacities, (opacities > 0) & (opacities < 1), "between 0 and 1")
         if flat:
@@ -303,8 +303,19 @@ def quat_to_R_t(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
     Differentiable in: quats.
     """
     check_tensor("quats", quats, ("N", 4), {})
-    _check_lengths(quats)
+    check_lengths(quats)
     return unchecked_rotations(quats)
+
+
+def check_lengths(quats: Float[Tensor, "... 4"]) -> None:
+    """Check that no quaternion has zero length.
+
+    Raises:
+        ArgumentError: one has.
+    """
+    zero = (quats.detach() == 0).all(dim=-1)
+    if bool(zero.any()):
+        raise ArgumentError(f"quats{first_index(zero.numpy(force=True))}: has zero length")
 
 
 def unchecked_rotations(quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
@@ -363,12 +374,6 @@ def _check_kind(name: str, value: object, means: object, wanted: str = "means ar
     if isinstance(means, Tensor) and (value.dtype, value.device) != (means.dtype, means.device):
         kind = f"{means.dtype} on {means.device}"
         raise ArgumentError(f"{name}: is {value.dtype} on {value.device}, but {wanted} {kind}")
-
-
-def _check_lengths(quats: Float[Tensor, "N 4"]) -> None:
-    zero = (quats.detach() == 0).all(dim=-1)
-    if bool(zero.any()):
-        raise ArgumentError(f"quats{first_index(zero.numpy(force=True))}: has zero length")
 
 
 def _check_entries(name: str, value: Tensor, valid: Tensor, wanted: str) -> None:

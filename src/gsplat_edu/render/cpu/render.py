@@ -66,11 +66,12 @@ class _Call:
     collecting: bool = False
     errors: Tensor | None = None
     statistics: Tensor | None = None
+    order: Tensor | None = None
 
     def for_features(self) -> _Call:
         """Return a call that composites further features of the same view."""
         settings = dataclasses.replace(self.settings, depth=False, median_depth=False)
-        return _Call(self.camera, settings, self.sh_degree, self.direct, self.needed)
+        return _Call(self.camera, settings, self.sh_degree, self.direct, self.needed, order=self.order)
 
 
 def render_cpu(
@@ -145,6 +146,30 @@ def render_covariances(
     value, pose = split_camera(camera if isinstance(camera, CameraTensors) else as_camera("camera", camera))
     call = _Call(value, settings, 0, direct=True)
     return _output(call, Extra(background, features), pose, means, cov3ds.double(), colors, opacities)
+
+
+@opaque
+def render_on_screen(
+    parameters: tuple[Tensor, Tensor, Tensor, Tensor],
+    camera: Camera,
+    settings: RenderSettings,
+    features: Tensor | None,
+    order: Tensor | None,
+) -> RenderOutput:
+    """Render covariances over black, as `render_covariances` does, without checks of shapes.
+
+    Args:
+        parameters: Means, covariances (float64), colours and opacities.
+        camera: A pinhole.
+        settings: The settings.
+        features: (N, C) features to composite, or None.
+        order: (N,) not negative, of the means' dtype: sorted by it instead of by depth; None for the depth.
+
+    Returns:
+        The view. Differentiable in the parameters and features.
+    """
+    call, (_, pose) = _Call(camera, settings, 0, direct=True, order=order), split_camera(camera)
+    return _output(call, Extra(parameters[0].new_zeros(3), features), pose, *parameters)
 
 
 RAW = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
@@ -286,7 +311,7 @@ class _Rasterize(torch.autograd.Function):
         kept = [p.detach().contiguous() for p in parameters]
         given = None if features is None else features.detach().contiguous()
         frame = kernel("FrameF", means.dtype)(
-            scene=_scene(kept, call.direct),
+            scene=_scene(kept, call.direct, call.order),
             camera=_camera(camera, settings),
             settings=native().Settings(
                 z_near=settings.z_near,
@@ -379,8 +404,9 @@ def _arrays(parameters: list[Tensor], direct: bool) -> dict[str, Any]:
     return dict(zip(DIRECT if direct else RAW, map(native_array, parameters), strict=True))
 
 
-def _scene(parameters: list[Tensor], direct: bool) -> Any:  # noqa: ANN401
-    return native().Scene(**_arrays(parameters, direct))
+def _scene(parameters: list[Tensor], direct: bool, order: Tensor | None = None) -> Any:  # noqa: ANN401
+    named = {} if order is None else {"order": native_array(order)}
+    return native().Scene(**_arrays(parameters, direct), **named)
 
 
 def _images(*tensors: Tensor | None) -> Any:  # noqa: ANN401
