@@ -48,6 +48,7 @@ def reference() -> str:
     parts += [
         _section("python train/train_2d.py", _script("train_2d.py").build_parser()),
         _train_3d(),
+        _section("python train/own_loop.py", _script("own_loop.py").build_parser()),
     ]
     return "\n".join(parts)
 

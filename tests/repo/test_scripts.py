@@ -23,6 +23,7 @@ MADE = {f"benchmarks/{name}" for name in ("sphere.py", "dense.py", "ladder", "tr
 """Benchmarks that `make bench` runs."""
 
 TRAININGS = {
+    "own_loop.py": ("--iters", "3"),
     "train_2d.py": ("--splats", "5", "--iters", "2", "--size", "12"),
     "train_3d.py": ("--iters", "3", "--size", "16", "--k0", "10"),
 }

@@ -49,14 +49,7 @@ class Scene:
         return str(scene_shower().scene_html(self))
 
     def view(self, height: int = 480) -> object:
-        """Return the viewer's page of the scene, which a notebook shows in a frame, to turn and to walk.
-
-        Args:
-            height: Height of the frame, px.
-
-        Raises:
-            ArgumentError: the height is not a whole number of at least 100, or a parameter is NaN or infinite.
-        """
+        """Return the viewer's page of the scene; `Gaussians.view` has the argument and the errors."""
         page: object = scene_shower().scene_page(self, height)
         return page
 

@@ -5,7 +5,7 @@ Chapters: 07_a_trained_scene, 13_back_to_the_parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gsplat_edu.base.constants import C0, SH_OFFSET
 from gsplat_edu.base.derivatives import refuse_halves
 from gsplat_edu.base.errors import ArgumentError, ShapeError
 from gsplat_edu.base.pictures import scene_shower
@@ -47,12 +48,7 @@ class Gaussians:
         """Check that shapes, dtypes and devices agree."""
         given: dict[str, object] = dict(self.tensors())
         for name, tensor in given.items():
-            if not (isinstance(tensor, Tensor) and tensor.is_floating_point()):
-                raise ArgumentError(f"{name}: has to be a float tensor, got {type(tensor).__name__}")
-            refuse_halves(name, tensor)
-            if (tensor.dtype, tensor.device) != (self.means.dtype, self.means.device):
-                wanted = f"{self.means.dtype} on {self.means.device}"
-                raise ArgumentError(f"{name}: is {tensor.dtype} on {tensor.device}, but means are {wanted}")
+            _check_kind(name, tensor, self.means)
         sizes: dict[str, int] = {}
         for name, shape in {
             "means": ("N", 3),
@@ -67,6 +63,76 @@ class Gaussians:
             raise ShapeError(
                 f"sh_rest: holds {sizes['K']} coefficients per channel, but degrees 0-3 have 0, 3, 8, 15"
             )
+
+    @classmethod
+    def from_activated(
+        cls,
+        means: Float[Tensor, "N 3"],
+        quats: Float[Tensor, "N 4"],
+        scales: Float[Tensor, "N 3"],
+        opacities: Float[Tensor, " N"],
+        colors: Float[Tensor, "N 3"] | Float[Tensor, "N K 3"],
+    ) -> Gaussians:
+        """Make Gaussians of the quantities that are rendered.
+
+        log_scales = log(scales),  logit_opacities = log(o / (1 - o)),  sh0 = (colour - 0.5) / C0
+
+        Args:
+            means: (N, 3) centres, world units.
+            quats: (N, 4) quaternions (w, x, y, z) of nonzero length.
+            scales: (N, 3) standard deviations, world units, above 0.
+            opacities: (N,) between 0 and 1, both excluded.
+            colors: (N, 3) colours from 0 to 1, or (N, K, 3) harmonics, degree 0 first: K = 1, 4, 9 or 16.
+
+        Raises:
+            ShapeError: a shape differs, or the arguments have different N.
+            ArgumentError: an entry is NaN, infinite or out of range, a quaternion has zero length, or an argument is
+                not a float32 or float64 tensor of the same dtype and device as the means.
+
+        Differentiable in: every argument.
+        """
+        sizes: dict[str, int] = {}
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+        check_tensor("colors", colors, ("...",), {})
+        flat = colors.ndim == 2
+        shapes: tuple[Shape, ...] = (
+            ("N", 3),
+            ("N", 4),
+            ("N", 3),
+            ("N",),
+            ("N", 3) if flat else ("N", "K", 3),
+        )
+        for (name, tensor), shape in zip(given.items(), shapes, strict=True):
+            check_tensor(name, tensor, shape, sizes)
+            _check_kind(name, tensor, means)
+        if not flat and sizes["K"] not in (1, 4, 9, 16):
+            raise ShapeError(
+                f"colors: holds {sizes['K']} coefficients per channel, but degrees 0-3 have 1, 4, 9, 16"
+            )
+        check_lengths(quats)
+        _check_entries("scales", scales, scales > 0, "above 0")
+        _check_entries("opacities", opacities, (opacities > 0) & (opacities < 1), "between 0 and 1")
+        if flat:
+            _check_entries("colors", colors, (colors >= 0) & (colors <= 1), "from 0 to 1")
+            colors = (colors[:, None] - SH_OFFSET) / C0
+        logits = torch.log(opacities) - torch.log1p(-opacities)
+        return cls(means, quats, torch.log(scales), colors[:, :1], colors[:, 1:], logits)
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Tensor]) -> Gaussians:
+        """Make the Gaussians whose `state_dict` this is; their number is that of the state.
+
+        Args:
+            state: The raw parameters by name.
+
+        Raises:
+            ShapeError, ArgumentError: a parameter is missing, unknown, or as for the constructor.
+        """
+        names = [field.name for field in fields(cls)]
+        if differing := sorted(set(names) ^ set(state)):
+            problem = "is missing" if differing[0] in names else "is unknown"
+            raise ArgumentError(f"state: {quoted(differing[0])} {problem}")
+        return cls(**state)
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -150,6 +216,31 @@ class Gaussians:
         """Return the raw parameters by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def parameters(self) -> Iterator[Tensor]:
+        """Yield the raw parameters, in the order of the fields."""
+        return iter(self.tensors().values())
+
+    def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Return a group for each named parameter, as the optimisers of `torch.optim` take them.
+
+        Args:
+            rates: Learning rates by the name of the raw parameter; a parameter without a rate is in no group.
+
+        Returns:
+            Groups with the keys params, lr and name.
+
+        Raises:
+            ArgumentError: a name is not that of a raw parameter.
+        """
+        tensors = self.tensors()
+        if unknown := sorted(set(rates) - set(tensors)):
+            raise ArgumentError(f"rates: {quoted(unknown[0])} is not one of {', '.join(tensors)}")
+        return [{"params": [tensors[name]], "lr": rate, "name": name} for name, rate in rates.items()]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the raw parameters by name, without gradients; they share memory with these Gaussians."""
+        return {name: tensor.detach() for name, tensor in self.tensors().items()}
+
     def check_finite(self) -> None:
         """Check that no raw parameter is NaN or infinite.
 
@@ -180,7 +271,18 @@ class Gaussians:
 
     @staticmethod
     def concatenated(parts: Sequence[Gaussians]) -> Gaussians:
-        """Join Gaussians in the given order; all must have the same SH degree."""
+        """Join Gaussians in the given order.
+
+        Raises:
+            ArgumentError: there are none, or two differ in SH degree, dtype or device.
+        """
+        if not parts:
+            raise ArgumentError("parts: is empty; give at least one set of Gaussians")
+        for number, part in enumerate(parts):
+            _check_kind(f"parts[{number}]", part.means, parts[0].means, "parts[0] is")
+            if part.sh_degree != parts[0].sh_degree:
+                degrees = f"{part.sh_degree}, but parts[0] has {parts[0].sh_degree}"
+                raise ArgumentError(f"parts[{number}]: has SH degree {degrees}")
         tensors = [part.tensors() for part in parts]
         return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
 
@@ -262,6 +364,24 @@ def cov3d_t(log_scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Fl
     check_tensor("quats", quats, ("N", 4), sizes)
     RS = quat_to_R_t(quats) * torch.exp(log_scales)[:, None, :]
     return RS @ RS.mT
+
+
+def _check_kind(name: str, value: object, means: object, wanted: str = "means are") -> None:
+    """Check that a value is a float32 or float64 tensor of the dtype and device of other Gaussians' means."""
+    if not (isinstance(value, Tensor) and value.is_floating_point()):
+        raise ArgumentError(f"{name}: has to be a float tensor, got {type(value).__name__}")
+    refuse_halves(name, value)
+    if isinstance(means, Tensor) and (value.dtype, value.device) != (means.dtype, means.device):
+        kind = f"{means.dtype} on {means.device}"
+        raise ArgumentError(f"{name}: is {value.dtype} on {value.device}, but {wanted} {kind}")
+
+
+def _check_entries(name: str, value: Tensor, valid: Tensor, wanted: str) -> None:
+    """Check that every entry is in its range, which `wanted` describes."""
+    if not bool(valid.all()):
+        wrong = float(value.detach()[~valid][0])
+        where = first_index((~valid).numpy(force=True))
+        raise ArgumentError(f"{name}{where}: is {wrong:g}, but has to be {wanted}")
 
 
 def check_tensor(name: str, value: Tensor, shape: Shape, sizes: dict[str, int]) -> None:

@@ -180,9 +180,7 @@ class Adam:
         for moments in (self.first, self.second):
             for name, old in moments.items():
                 if self.groups[name].per_gaussian:
-                    rows = torch.where(origins < 0, len(old), origins)
-                    padded = torch.cat([old, old.new_zeros(1, *old.shape[1:])])
-                    moments[name] = padded.index_select(0, rows)
+                    moments[name] = _rows_from(old, origins)
 
     def state(self) -> tuple[dict[str, dict[str, Tensor]], int]:
         """Return the moments, as "first" and "second", and the number of views of the steps taken."""
@@ -212,6 +210,61 @@ class Adam:
             for part in MOMENTS
         )
         self.steps = steps
+
+
+@torch.no_grad()
+def carry_state(
+    optimizer: torch.optim.Optimizer, before: Gaussians, after: Gaussians, origins: Int64[Tensor, " M"]
+) -> None:
+    """Put changed Gaussians in the place of the old ones in an optimiser of torch; survivors keep their state.
+
+    State of a parameter's shape (moments, momentum) follows its rows. Counts of steps stay.
+
+    Args:
+        optimizer: Has some or all of the parameters of `before`, in any groups.
+        before: The N Gaussians before the change.
+        after: The M Gaussians after it, leaves that collect gradients.
+        origins: (M,) for each Gaussian after the change its index before it, whose state it keeps; -1 for a new one,
+            whose state starts at zero.
+
+    Raises:
+        ArgumentError: an index is out of range or their number is not M, the optimiser has none of the parameters, a
+            new parameter is no leaf that collects gradients, or the state has another shape (LBFGS, Adafactor);
+            nothing has changed.
+    """
+    if origins.shape != (len(after),):
+        raise ArgumentError(f"origins: has shape {tuple(origins.shape)}, but has to be ({len(after)},)")
+    if len(origins) and not (int(origins.min()) >= -1 and int(origins.max()) < len(before)):
+        raise ArgumentError(f"origins: names a Gaussian beyond the {len(before)} before the change")
+    names = {id(tensor): name for name, tensor in before.tensors().items()}
+    replaced: dict[Tensor, Tensor] = {}
+    for old in (p for group in optimizer.param_groups for p in group["params"] if id(p) in names):
+        name, new = names[id(old)], getattr(after, names[id(old)])
+        if not (new.is_leaf and new.requires_grad):
+            raise ArgumentError(f"after: {name} has to be a leaf that collects gradients; call trainable()")
+        for key, value in optimizer.state.get(old, {}).items():
+            if isinstance(value, (list, dict)) or (
+                isinstance(value, Tensor) and value.ndim and value.shape != old.shape
+            ):
+                kind = type(optimizer).__name__
+                raise ArgumentError(f"optimizer: {key} of {kind} has no row for each Gaussian")
+        replaced[old] = new
+    if not replaced:
+        raise ArgumentError("optimizer: has none of the parameters of these Gaussians")
+    for old, new in replaced.items():
+        if old in optimizer.state:
+            optimizer.state[new] = {
+                key: _rows_from(value, origins) if isinstance(value, Tensor) and value.ndim else value
+                for key, value in optimizer.state.pop(old).items()
+            }
+    for group in optimizer.param_groups:
+        group["params"] = [replaced.get(old, old) for old in group["params"]]
+
+
+def _rows_from(old: Tensor, origins: Int64[Tensor, " M"]) -> Tensor:
+    """Return the rows of a tensor at these indices, zeros for -1."""
+    rows = torch.where(origins < 0, len(old), origins)
+    return torch.cat([old, old.new_zeros(1, *old.shape[1:])]).index_select(0, rows)
 
 
 def _check_moments(name: str, parameter: Tensor, moments: tuple[Tensor, Tensor]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsplat_edu.scene.gaussians import Gaussians, quat_to_R_t
 from gsplat_edu.scene.morton import order_in_space
-from gsplat_edu.train.optimizer import Adam
+from gsplat_edu.train.optimizer import Adam, carry_state
 
 
 @torch.no_grad()
@@ -74,7 +74,7 @@ def long_axis_children(parents: Gaussians) -> list[Gaussians]:
 @torch.no_grad()
 def replace(
     gaussians: Gaussians,
-    optimizer: Adam,
+    optimizer: Adam | torch.optim.Optimizer,
     keep: Bool[Tensor, " N"],
     newborn: list[Gaussians],
     cap: int | None = None,
@@ -86,7 +86,8 @@ def replace(
 
     Args:
         gaussians: The N Gaussians.
-        optimizer: Its moments follow: survivors keep theirs, new Gaussians start from zero.
+        optimizer: Its moments follow: survivors keep theirs, new Gaussians start from zero. An optimiser of torch gets
+            the new parameters, too; see `carry_state`.
         keep: (N,) true for the survivors.
         newborn: Gaussians to add; the last ones are the first to be dropped.
         cap: Largest number of Gaussians afterwards; None for no cap.
@@ -104,8 +105,13 @@ def replace(
     replaced = {
         name: torch.cat([part[name] for part in everyone]).index_select(0, chosen) for name in everyone[0]
     }
-    optimizer.follow(torch.where(chosen < len(gaussians), chosen, -1))
-    return Gaussians(**replaced).map(lambda tensor: tensor.requires_grad_())
+    origins = torch.where(chosen < len(gaussians), chosen, -1)
+    after = Gaussians(**replaced).map(lambda tensor: tensor.requires_grad_())
+    if isinstance(optimizer, Adam):
+        optimizer.follow(origins)
+    else:
+        carry_state(optimizer, gaussians, after, origins)
+    return after
 
 
 @torch.no_grad()
