@@ -21,5 +21,5 @@ if [ "${GSPLAT_EDU_SOAK:-}" != 1 ]; then
     export GSPLAT_EDU_FUZZ_CHECKPOINTS="${GSPLAT_EDU_FUZZ_CHECKPOINTS:-850}" GSPLAT_EDU_FUZZ_CONFIGS="${GSPLAT_EDU_FUZZ_CONFIGS:-60}"
 fi
 LD_PRELOAD="$preload" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-    GSPLAT_TEST_NATIVE="$build" "$python" -m pytest -q -n "${WORKERS:-2}" --dist loadfile tests/native tests/compat/test_surfels.py tests/mesh/test_volume.py tests/mesh/test_marching_cubes.py tests/test_losses.py tests/test_noise.py tests/test_recolor.py tests/train/test_optimizer.py \
+    GSPLAT_TEST_NATIVE="$build" "$python" -m pytest -q -n "${WORKERS:-2}" --dist loadfile tests/native tests/compat/test_surfels.py tests/compat/test_screen.py tests/mesh/test_volume.py tests/mesh/test_marching_cubes.py tests/test_losses.py tests/test_noise.py tests/test_recolor.py tests/train/test_optimizer.py \
     tests/train/test_checkpoint.py tests/fuzz/test_checkpoints.py tests/fuzz/test_configs.py -m "not own_process" -k "$but" -p no:cacheprovider --capture=sys

@@ -148,6 +148,51 @@ def surfels_backward(**changes):
     _native.surfels_backward_f32(**surfel_arrays() | numbers | fields | changes)
 
 
+def screen_inputs():
+    solids = {
+        "means": torch.ones(N, 3),
+        "covars": None,
+        "quats": torch.ones(N, 4),
+        "scales": torch.ones(N, 3),
+    }
+    numbers = {"viewmat": [1.0] * 12, "K": [1.0] * 4, "size": (W, H), "margin": 0.1, "eps2d": 0.3}
+    return solids | numbers | {"z_near": 0.1, "z_far": 9.0, "threads": 2}
+
+
+def screen(**changes):
+    fields = {"centres": (N, 2), "depths": (N,), "conics": (N, 3), "compensations": (N,), "spreads": (N, 3)}
+    out = {name: torch.empty(shape, dtype=torch.float64) for name, shape in fields.items()}
+    out["drawable"] = torch.empty(N, dtype=torch.uint8)
+    _native.screen_f32(**screen_inputs() | out | changes)
+
+
+def screen_backward(**changes):
+    names = ("centres", "depths", "conics", "compensations", "spreads")
+    fields = {f"grad_{name}": None for name in names}
+    fields |= {f"grad_{name}": torch.zeros(N, k) for name, k in (("means", 3), ("quats", 4), ("scales", 3))}
+    assert _native.screen_backward_f32(**screen_inputs() | fields | changes) == [0.0] * 16
+
+
+def radii(**changes):
+    fields = {"centres": torch.zeros(N, 2).double(), "spreads": torch.ones(N, 3).double()}
+    fields |= {"drawable": torch.ones(N, dtype=torch.uint8), "opacities": None, "compensations": None}
+    fields |= {"size": (W, H), "eps2d": 0.3, "extent": 3.0, "radius_clip": 0.0, "threads": 2}
+    _native.radii_f32(**fields | {"radii": torch.empty(N, 2, dtype=torch.int32)} | changes)
+
+
+def harmonics(**changes):
+    fields = {"directions": torch.ones(2, 3), "coefficients": torch.ones(N, 4, 3), "degree": 1}
+    fields |= {"rows": torch.tensor([3, 1]), "colors": torch.empty(2, 3), "threads": 2}
+    _native.harmonics_f32(**fields | changes)
+
+
+def harmonics_backward(**changes):
+    fields = {"directions": torch.ones(2, 3), "coefficients": torch.ones(N, 4, 3), "degree": 1}
+    fields |= {"rows": torch.tensor([3, 1]), "grad_colors": torch.ones(2, 3), "overwrites": True}
+    fields |= {"grad_directions": torch.empty(2, 3), "grad_coefficients": torch.empty(N, 4, 3), "threads": 2}
+    _native.harmonics_backward_f32(**fields | changes)
+
+
 CALLS = {
     camera: ("R", "eye", "fx", "fy", "cx", "cy", "x_bounds", "y_bounds", "H", "W"),
     settings: ("z_near", "background", "sh_degree", "antialiased", "alpha_max", "pixel_stop"),
@@ -171,6 +216,20 @@ CALLS = {
         *surfel_arrays(),
         *("grad_image", "grad_transmittance", "grad_distortion", "grad_median", "out", "depth", "threads"),
     ),
+    screen: (
+        *screen_inputs(),
+        *("centres", "depths", "conics", "compensations", "spreads", "drawable"),
+    ),
+    screen_backward: (
+        *("grad_centres", "grad_depths", "grad_conics", "grad_compensations", "grad_spreads"),
+        *("grad_means", "grad_quats", "grad_scales"),
+    ),
+    radii: (
+        *("centres", "spreads", "drawable", "opacities", "compensations", "size", "eps2d"),
+        *("extent", "radius_clip", "radii", "threads"),
+    ),
+    harmonics: ("directions", "coefficients", "degree", "rows", "colors", "threads"),
+    harmonics_backward: ("grad_colors", "grad_directions", "grad_coefficients", "overwrites", "threads"),
 }
 EVERY = [(call, name) for call, names in CALLS.items() for name in names]
 
