@@ -25,6 +25,7 @@ what is on the screen once more, which `gsplat_edu.render.api.render` need not d
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -244,7 +245,10 @@ def _geometry(a: Arguments) -> list[Tensor]:
 def _images(a: Arguments, drawn: Drawn, on_screen: _OnScreen, kept: Absgrad | None) -> list[Tensor]:
     """Return images, alphas and, if there are any, extra signals."""
     views = _draw(a, drawn, on_screen, kept)
-    image, transmittance = (torch.stack(each).view(*a.batch, a.C, *each[0].shape) for each in views)
+    image, transmittance = (
+        (torch.stack(each) if len(each) > 1 else each[0]).view(*a.batch, a.C, *each[0].shape)
+        for each in views
+    )
     alphas, signals = 1.0 - transmittance[..., None], []
     if a.extra_signals is not None:
         E = a.extra_signals.shape[-1]
@@ -260,11 +264,11 @@ def _draw(
     a: Arguments, drawn: Drawn, on_screen: _OnScreen, kept: Absgrad | None
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Draw every image."""
-    *own, spreads = on_screen
+    *shared, spreads = on_screen
     rows = torch.arange(len(spreads)) if a.packed else drawn.positions  # in the tensors of `meta`
     if not a.packed:
-        own = [joined(each, len(a.batch) + 2).index_select(0, rows) for each in own]
-    means2d, depths, opacities = own
+        shared = [joined(each, len(a.batch) + 2).index_select(0, rows) for each in shared]
+    means2d, depths, opacities = shared
     with_depth = a.render_mode != "RGB"
     colors = None if a.render_mode in DEPTH_ONLY or a.colors is None else colors_of(a, a.colors, drawn)
     signals = None if a.extra_signals is None else _extra_signals(a, a.extra_signals, drawn)
@@ -272,22 +276,28 @@ def _draw(
     if colors is None and signals is None:
         backgrounds = None  # a depth has no background
     images, transmittances = [], []
-    for k, (begin, end) in enumerate(zip([0, *drawn.ends], drawn.ends, strict=False)):
-        part = slice(begin, end)
-        splats = Splats(
-            means2d[part],
-            spreads[part],
-            opacities[part],
-            None if colors is None else colors[part],
-            depths[part] if with_depth else None,
-            None if backgrounds is None else backgrounds[k],
-            None if signals is None else signals[part],
-            order=depths.detach()[part] + 0.0,  # not -0
-        )
-        image, transmittance = composite(splats, _lens(a), None if kept is None else kept.adder(rows[part]))
+    tables: dict[str, Any] = {
+        "means2d": means2d,
+        "spreads": spreads,
+        "opacities": opacities,
+        "colors": colors,
+    }
+    tables |= {"depths": depths if with_depth else None, "extra_signals": signals}
+    tables |= {"order": depths.detach() + 0.0, "rows": rows}  # no -0
+    parts = {name: _parts(each, drawn.ends) for name, each in tables.items() if each is not None}
+    for k in range(len(drawn.ends)):
+        own: dict[str, Any] = {name: parts[name][k] if name in parts else None for name in tables}
+        own_rows = own.pop("rows")
+        splats = Splats(**own, background=None if backgrounds is None else backgrounds[k])
+        image, transmittance = composite(splats, _lens(a), None if kept is None else kept.adder(own_rows))
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances
+
+
+def _parts(tensor: Tensor, ends: list[int]) -> Sequence[Tensor]:
+    """Split the rows of all images; the only one is returned as it is, because a slice costs a copy backward."""
+    return [tensor] if len(ends) == 1 else torch.tensor_split(tensor, ends[:-1])
 
 
 def _extra_signals(a: Arguments, signals: Tensor, drawn: Drawn) -> Float[Tensor, "nnz E"]:

@@ -67,15 +67,17 @@ def composite(
     """
     M = len(splats.opacities)
     colors = splats.means2d.new_zeros(M, 0) if splats.colors is None else splats.colors
-    front, features = colors[:, :COLOR_CHANNELS], colors[:, COLOR_CHANNELS:]
+    front, further = colors, list[Tensor]()
+    if colors.shape[1] > COLOR_CHANNELS:
+        front, further = colors[:, :COLOR_CHANNELS], [colors[:, COLOR_CHANNELS:]]
     # Extra signals and depth are features, never colours, because the kernels skip Gaussians whose colours exceed
     # COLOR_LIMIT.
-    if splats.extra_signals is not None:
-        features = torch.cat([features, splats.extra_signals], dim=1)
-    if splats.depths is not None:
-        features = torch.cat([features, splats.depths[:, None]], dim=1)
-    view = _render(splats, front, features, lens, absgrad)
-    transmittance, image = view.transmittance, view.image[..., : front.shape[1]]
+    further += [] if splats.extra_signals is None else [splats.extra_signals]
+    further += [] if splats.depths is None else [splats.depths[:, None]]
+    view = _render(splats, front, torch.cat(further, dim=1) if further else None, lens, absgrad)
+    transmittance, image = view.transmittance, view.image
+    if front.shape[1] < COLOR_CHANNELS:
+        image = image[..., : front.shape[1]]
     if view.features is not None:
         image = torch.cat([image, view.features], dim=-1)
     if splats.background is not None:
@@ -87,7 +89,7 @@ def composite(
 def _render(
     splats: Splats,
     front: Float[Tensor, "M F"],
-    features: Float[Tensor, "M G"],
+    features: Float[Tensor, "M G"] | None,
     lens: Lens,
     absgrad: Callable[[Int64[Tensor, " V"], Tensor], None] | None,
 ) -> RenderOutput:
@@ -104,7 +106,7 @@ def _render(
         ),
         Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
         dataclasses.replace(SETTINGS, dilation=lens.eps2d),
-        features if features.shape[1] else None,
+        features,
         splats.order,
     )
     if absgrad is not None and means.requires_grad:
