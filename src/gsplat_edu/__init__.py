@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from gsplat_edu.data.dataset import load_dataset
     from gsplat_edu.io.formats import read_scene, write_scene
     from gsplat_edu.io.scene import Scene
+    from gsplat_edu.render.api import render  # the package, which can be called
     from gsplat_edu.render.backends import load_backend
     from gsplat_edu.render.settings import RenderSettings
     from gsplat_edu.scene.gaussians import Gaussians
