@@ -93,7 +93,7 @@ def test_without_a_place_on_earth_coordinates_are_the_scenes_own(tmp_path, scene
     assert file.header.parse_crs() is None and not file.header.vlrs
     said = "\n".join(losses(tmp_path / "a.las", scene))
     left_out = 200 - len(file.points)
-    assert f"{left_out} of 200 splats have an opacity below 0.1 and are left out" in said
+    assert f"{left_out} of 200 splats have an opacity below 0.05 and are left out" in said
     assert "coordinates are the scene's own, because its place on earth is not known" in said
     placed = replace(scene, earth=Earth.at_place(47.0, 8.0, 400.0))
     assert not any("place on earth" in line for line in losses(tmp_path / "a.las", placed))
@@ -117,7 +117,7 @@ def test_steps_fit_the_integers_and_are_fine():
 
 def test_what_cannot_be_written_is_one_line(tmp_path, scene):
     haze = scene.gaussians.logit_opacities - 20.0
-    with pytest.raises(ArgumentError, match=r"a\.las: no splat has an opacity of 0\.1"):
+    with pytest.raises(ArgumentError, match=r"a\.las: no splat has an opacity of 0\.05"):
         write_scene(
             tmp_path / "a.las", replace(scene, gaussians=replace(scene.gaussians, logit_opacities=haze))
         )

@@ -32,8 +32,8 @@ from gsplat_edu.io.scene import Scene
 from gsplat_edu.scene.earth import EARTH_CENTRED, Earth, converted, geodetic
 from gsplat_edu.scene.gaussians import Gaussians
 
-LEAST_OPACITY = 0.1
-"""Fainter splats are no points: they are haze, not surfaces."""
+LEAST_OPACITY = 0.05
+"""Fainter splats are no points: they are haze, not surfaces. A training starts at 0.1."""
 
 FULL = 65535.0
 """Full brightness of a channel, and the intensity of an opacity of 1."""
