@@ -260,5 +260,5 @@ def test_a_point_cloud_is_written_and_says_what_it_is_for(convert, tmp_path, cap
     for words in (["info", out], ["convert", out, tmp_path / "a.ply"], ["view", out]):
         assert main(list(map(str, words))) == 2
         error = capsys.readouterr().err
-        assert "out.laz: is a point cloud, not a scene; start a training from it with train --points" in error
+        assert "out.laz: is a point cloud, not a scene; give it to a training as points" in error
         assert error.count("\n") == 1

@@ -129,7 +129,9 @@ def test_what_cannot_be_written_is_one_line(tmp_path, scene):
 
 def test_a_point_cloud_is_no_scene(tmp_path, scene):
     write_scene(tmp_path / "a.laz", scene)
-    with pytest.raises(SceneFormatError, match=r"a\.laz: is a point cloud, not a scene; .* train --points$"):
+    with pytest.raises(
+        SceneFormatError, match=r"a\.laz: is a point cloud, not a scene; give it to a training as `points`$"
+    ):
         read_scene(tmp_path / "a.laz")
 
 

@@ -63,9 +63,7 @@ def read(path: Path) -> NoReturn:
     Raises:
         SceneFormatError: a point cloud is no scene.
     """
-    raise SceneFormatError(
-        f"{path}: is a point cloud, not a scene; start a training from it with train --points"
-    )
+    raise SceneFormatError(f"{path}: is a point cloud, not a scene; give it to a training as `points`")
 
 
 def write(path: Path, scene: Scene) -> None:
