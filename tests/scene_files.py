@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
+from gsplat_edu.base.constants import POINT_SUFFIXES
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import FORMATS, LOD_META, SOG_META, read_scene, write_scene
 from gsplat_edu.io.lod import codec as lod
@@ -82,7 +83,8 @@ def small_file(folder: Path, suffix: str, rest: int = 3) -> Path:
 def suffixes() -> list[str]:
     """Return the suffixes of the formats that can be read here: those of USD need a library."""
     there = importlib.util.find_spec("pxr") is not None
-    return [found.suffix for found in FORMATS if there or found.suffix not in IN_A_PROCESS]
+    known = [found.suffix for found in FORMATS if found.suffix not in POINT_SUFFIXES]
+    return [suffix for suffix in known if there or suffix not in IN_A_PROCESS]
 
 
 def small_folder(folder: Path) -> Path:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gsplat_edu.cli.main import main
+from gsplat_edu.data.point_files import read_points
 from gsplat_edu.evaluate.metrics import psnr
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.io.mesh_files import write_mesh
@@ -167,7 +168,8 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
         (["gone.ply", "out.ply"], "gone.ply: does not exist"),
         (
             ["IN", "out.obj"],
-            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .usda, .usdc, .usdz, .rad, .csv,",
+            "known are .compressed.ply, .ply, .splat, .ksplat, .spz, .sog, .glb, .usda, .usdc, .usdz, .rad, .csv,"
+            " .las, .laz, .html,",
         ),
         (["IN", "."], "unknown scene format"),
         (["IN", "IN/out.ply"], "is a file; give a folder"),
@@ -183,6 +185,7 @@ def test_a_page_carries_a_mesh_that_moves_with_the_scene(convert, tmp_path):
         (["IN", "out.ply", "--transform", "rotate=w:90"], "cannot be read"),
         (["IN", "out.ply", "--transform", "move=1,2"], "cannot be read"),
         (["IN", "out.ply", "--transform", "matrix=gone.txt"], "gone.txt"),
+        (["IN", "out.laz", "--verify"], "--verify: out.laz is a point cloud"),
         (["IN", "out.glb", "--verify", "--backend", "abacus"], "abacus"),
         (
             ["IN", "out.ply", "--path", "IN"],
@@ -245,3 +248,17 @@ def test_tiles_are_written_and_verified(convert, plain, tmp_path):
     assert "not placed on the globe: the scene does not say where on earth it is" in said
     assert "PSNR" in convert(plain, out, "--verify")
     assert "a tile is a file" in convert(plain, out, "--lod-chunk", 5, code=2)
+
+
+def test_a_point_cloud_is_written_and_says_what_it_is_for(convert, tmp_path, capsys):
+    folder, *_ = make_run(tmp_path / "run", origin=(5e6, 4e5, 0.0))
+    out = tmp_path / "out.laz"
+    said = convert(folder.path, out)
+    assert f"wrote {out}: the centres of the splats as points" in said
+    assert "coordinates are the scene's own" in said and "relative to the origin" not in said
+    assert np.abs(np.median(read_points(out).points, axis=0) - (5e6, 4e5, 0.0)).max() < 10.0
+    for words in (["info", out], ["convert", out, tmp_path / "a.ply"], ["view", out]):
+        assert main(list(map(str, words))) == 2
+        error = capsys.readouterr().err
+        assert "out.laz: is a point cloud, not a scene; give it to a training as points" in error
+        assert error.count("\n") == 1

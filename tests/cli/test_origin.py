@@ -158,15 +158,20 @@ def test_files_of_a_capture_with_a_vertical_axis_stand_upright(capsys, tmp_path,
     assert read_scene(tmp_path / "a.spz").up == pytest.approx(tuple(up))
 
 
-def test_a_damaged_origin_of_a_run_is_one_line(made, capsys, tmp_path):
+def test_a_damaged_origin_or_place_of_a_run_is_one_line(made, capsys, tmp_path):
     root, _ = made
     run = RunFolder(root / "run")
     config = run.read_config()
     try:
-        for wrong in ([1.0, 2.0], "far", [1e31, 0.0, 0.0]):
-            run.write_config(config | {"origin": wrong})
+        origins = [({"origin": wrong}, "origin") for wrong in ([1.0, 2.0], "far", [1e31, 0.0, 0.0])]
+        places = [
+            ({"scale": {"earth": "here 1"}}, "place on earth"),
+            ({"scale": {"earth": []}}, "scale.earth"),
+        ]
+        for wrong, said in (*origins, *places):
+            run.write_config(config | wrong)
             assert main(["convert", str(root / "run"), str(tmp_path / "a.ply")]) == 2
             error = capsys.readouterr().err
-            assert "config.json: origin" in error and error.count("\n") == 1
+            assert f"config.json: {said}" in error and error.count("\n") == 1
     finally:
         run.write_config(config)

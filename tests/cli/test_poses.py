@@ -8,7 +8,7 @@ import gsplat_edu.cli.main as command_line
 from data.pose_programs import write_nvm, write_opensfm, write_polycam
 from gsplat_edu.data.left_out import LEFT_OUT
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.data.writers import write_colmap, write_transforms
 
 
 def said(capsys, *words, code=0):
@@ -31,6 +31,19 @@ def test_a_chosen_file_goes_before_a_colmap_model(tmp_path, capsys):
     write_opensfm(tmp_path)
     assert "COLMAP" in said(capsys, "info", tmp_path)
     assert "poses of OpenSfM" in said(capsys, "info", tmp_path, "--poses", "reconstruction.json")
+
+
+def test_a_colmap_model_goes_before_a_transforms_json(tmp_path, capsys):
+    capture, (views, points, colors) = tmp_path / "capture", procedural_capture(24, 6, splats=40)
+    write_transforms(capture, views)
+    write_colmap(capture, views[:5], points, colors)
+    assert "transforms.json" in said(capsys, "info", capture)
+    model, run = ("--poses", "sparse/0/images.bin"), tmp_path / "run"
+    assert "COLMAP" in said(capsys, "info", capture, *model)
+    few = ("--iterations", 1, "--backend", "cpu", "--trust-poses")
+    said(capsys, "train", capture, *model, "--out", run, *few)
+    assert len(json.loads((run / "cameras.json").read_text())) == 5
+    said(capsys, "train", capture, *model, "--out", run, *few, "--resume")
 
 
 def test_a_file_in_a_programs_own_folder_belongs_to_the_capture(tmp_path, capsys):

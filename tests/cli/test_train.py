@@ -331,11 +331,13 @@ def test_a_scene_is_exported_and_the_psnr_of_each_file_is_reported(tmp_path, cap
         "5",
         "--export",
         *files,
+        tmp_path / "points.laz",
     ]
     assert main([str(word) for word in words]) == 0
     said = capsys.readouterr().out
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert [entry["path"] for entry in metrics["exports"]] == [str(path) for path in files]
+    assert f"wrote {tmp_path / 'points.laz'}: the centres of the splats as points" in said
     for entry, path in zip(metrics["exports"], files, strict=True):
         assert entry["psnr"] > 30 and entry["num_views"] == 6 and entry["num_bytes"] == path.stat().st_size
         assert f"{path}: PSNR {entry['psnr']:.2f} dB over 6 views" in said

@@ -8,6 +8,7 @@ import numpy as np
 import pye57
 import pyproj
 import pytest
+from pye57 import libe57
 
 import gsplat_edu.cli.main as command_line
 from gsplat_edu.base.errors import DatasetError
@@ -43,15 +44,34 @@ def write_las(path, cloud, colored=True, bits=16):
     file.write(path)
 
 
-def write_e57(path, clouds, colored=True):
+class E57(pye57.E57):
+    """An E57 whose header names a system, which pye57 leaves empty."""
+
+    system = ""
+
+    def write_default_header(self):
+        file = self.image_file
+        file.extensionsAdd("", libe57.E57_V1_0_URI)
+        self.root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+        self.root.set("guid", libe57.StringNode(file, "{0}"))
+        self.root.set("versionMajor", libe57.IntegerNode(file, libe57.E57_FORMAT_MAJOR))
+        self.root.set("versionMinor", libe57.IntegerNode(file, libe57.E57_FORMAT_MINOR))
+        self.root.set("coordinateMetadata", libe57.StringNode(file, self.system))
+        self.root.set("data3D", libe57.VectorNode(file, True))
+
+
+def write_e57(path, clouds, colored=True, system=None, origin=FAR):
     """Each scan lies around its own origin, and its pose moves it to its place."""
-    with pye57.E57(str(path), mode="w") as file:
+    kind = pye57.E57 if system is None else type("Placed", (E57,), {"system": system})
+    with kind(str(path), mode="w") as file:
         for cloud in clouds:
-            data = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), (cloud.points - FAR).T, strict=True))
+            data = dict(
+                zip(("cartesianX", "cartesianY", "cartesianZ"), (cloud.points - origin).T, strict=True)
+            )
             if colored:
                 whole = np.round(255 * cloud.colors).astype(np.uint8)
                 data |= dict(zip(("colorRed", "colorGreen", "colorBlue"), whole.T, strict=True))
-            file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=FAR)
+            file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=origin)
 
 
 def write_pcd(path, cloud, way):
@@ -223,7 +243,11 @@ def placed(tmp_path):
 
 
 def write_mapped(path, places, crs):
-    """Write a LAS that names its system."""
+    """Write a LAS or an E57 that names its system."""
+    if path.suffix == ".e57":
+        text, cloud = pyproj.CRS(crs).to_wkt("WKT1_GDAL"), Cloud(places, np.full(places.shape, 0.5))
+        write_e57(path, [cloud], False, text, np.floor(places.min(axis=0)))
+        return
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.offsets, header.scales = np.floor(places.min(axis=0)), np.full(3, 1e-4)
     header.add_crs(pyproj.CRS(crs))
@@ -232,21 +256,34 @@ def write_mapped(path, places, crs):
     file.write(path)
 
 
-@pytest.mark.parametrize("crs", ["EPSG:32633", "EPSG:4978"])
+@pytest.mark.parametrize(
+    ("crs", "name"), [("EPSG:32633", "map.las"), ("EPSG:4978", "map.las"), ("EPSG:32633", "map.e57")]
+)
 def test_a_scan_in_another_reference_system_is_moved_to_a_capture_that_knows_its_place(
-    tmp_path, capsys, placed, crs
+    tmp_path, capsys, placed, crs, name
 ):
     folder, points = placed
     earth = Earth.at_place(47.0, 15.3, 400.0)
     places = converted(points @ earth.rows[:, :3].T + earth.rows[:, 3], EARTH_CENTRED, crs)
-    write_mapped(tmp_path / "map.las", places, crs)
-    assert read_points(tmp_path / "map.las").crs == crs
-    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las", code=2)
-    assert "map.las: the photos see 0 of" in err  # nobody knows where the capture is
+    write_mapped(tmp_path / name, places, crs)
+    assert read_points(tmp_path / name).crs == crs
+    err = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / name, code=2)
+    assert f"{name}: the photos see 0 of" in err  # nobody knows where the capture is
     write_scale(folder, Scale("m", "GPS", earth=earth))
-    out = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / "map.las")
+    out = trained(capsys, folder, tmp_path / "run", "--points", tmp_path / name)
     assert f"that the photos see, moved from {crs} to the capture's coordinates" in out
     np.testing.assert_allclose(read_points_ply(tmp_path / "run" / "points.ply").points, points, atol=2e-4)
+
+
+@pytest.mark.parametrize("system", ["", " ", "nowhere", 'LOCAL_CS["site"]', "EPSG:32633 garbage"])
+def test_an_e57_without_a_system_that_has_a_code_is_read_without_one(tmp_path, cloud, system):
+    write_e57(tmp_path / "a.e57", [cloud], system=system)
+    assert read_points(tmp_path / "a.e57").crs is None
+
+
+def test_heights_above_the_sea_keep_their_system(tmp_path, cloud):
+    write_e57(tmp_path / "a.e57", [cloud], system=pyproj.CRS("EPSG:32633+5773").to_wkt("WKT1_GDAL"))
+    assert read_points(tmp_path / "a.e57").crs == "EPSG:32633+5773"
 
 
 def test_the_system_of_a_scan_that_lies_elsewhere_is_named(tmp_path, capsys, placed):

@@ -11,11 +11,11 @@ from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.cli.main import main
 from gsplat_edu.data.dataset import load_dataset
 from gsplat_edu.data.lens import Lens
-from gsplat_edu.data.scale import Scale, read_scale
+from gsplat_edu.data.scale import Scale, read_scale, write_scale
 from gsplat_edu.io.formats import read_scene
 from gsplat_edu.runs.source import open_source
 from gsplat_edu.scene.camera import Camera
-from gsplat_edu.scene.earth import geodetic
+from gsplat_edu.scene.earth import Earth, geodetic
 from gsplat_edu.sfm.photos import PhotoFacts
 from gsplat_edu.sfm.reconstruct import SfmOptions, reconstruct
 from gsplat_edu.sfm.scale import Sight, in_given_world, placed
@@ -264,8 +264,19 @@ def test_a_scale_is_refused_if_poses_are_given(done, tmp_path, capsys):
     assert "--panorama: has an effect only if DATA has no poses" in capsys.readouterr().err
 
 
+def test_the_place_on_earth_is_the_text_of_scene_files(tmp_path):
+    scale = Scale("m", "GPS", "well", True, Earth.at_place(47.3769, 8.5417, 408.123))
+    write_scale(tmp_path, scale)
+    assert json.loads((tmp_path / "scale.json").read_text())["earth"] == str(scale.earth)
+    assert read_scale(tmp_path) == Scale.parsed("", scale.json()) == scale
+    write_scale(tmp_path, Scale("m", "GPS"))
+    assert read_scale(tmp_path) == Scale("m", "GPS")
+
+
 def test_a_damaged_scale_is_named(tmp_path):
-    for text in ("{", "[]", '{"unit": "m"}', '{"unit": 1, "source": "", "detail": ""}'):
+    wrong = ("{", "[]", '{"unit": "m"}', '{"unit": 1, "source": "", "detail": ""}')
+    elsewhere = ('"EPSG:4978 1 2"', '{"crs": "EPSG:4978", "matrix": []}')
+    for text in (*wrong, *(f'{{"unit": "m", "source": "GPS", "earth": {place}}}' for place in elsewhere)):
         (tmp_path / "scale.json").write_text(text)
         with pytest.raises(DatasetError, match=r"scale\.json: is damaged"):
             read_scale(tmp_path)

@@ -68,6 +68,11 @@ def test_the_commands_and_their_defaults(library):
         *("convert", "runs/a", "runs/a/exports/a.html", "--verify", "photos")
     ]
     (library.root / "runs" / "a" / "edits.json").touch()
+    assert words(command="convert", subject="runs/a", format="laz") == [
+        "convert",
+        "runs/a",
+        "runs/a/exports/a.laz",
+    ]
     assert words(command="convert", subject="runs/a", format="spz", edits=True) == [
         *("convert", "runs/a", "runs/a/exports/a.spz", "--edits", "runs/a/edits.json", "--verify")
     ]

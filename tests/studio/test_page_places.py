@@ -9,7 +9,7 @@ from data.pose_programs import CAMERAS, write_nvm, write_opensfm
 from gsplat_edu.data.chosen_poses import CHOSEN
 from gsplat_edu.data.left_out import LEFT_OUT, read_left_out, write_left_out
 from gsplat_edu.data.procedural import procedural_capture
-from gsplat_edu.data.writers import write_colmap
+from gsplat_edu.data.writers import write_colmap, write_transforms
 from gsplat_edu.scene.views import View
 from studio.pages import capture_frame, go
 from waiting import awaited, resize, until_in
@@ -121,7 +121,7 @@ def test_whose_poses_are_read_is_chosen_where_several_programs_left_some(visitor
     assert select.input_value() == ""
     frame = capture_frame(tab, "both")
     until_in(tab, frame, "viewer.cameras.list.length === 6")
-    select.select_option("VisualSFM: any name.nvm")
+    select.select_option("VisualSFM")
     tab.get_by_text("Poses of VisualSFM: 4 of 6 photos").wait_for()
     assert (folder / CHOSEN).read_text() == "any name.nvm\n"
     awaited(tab, lambda: capture_frame(tab, "both").evaluate("viewer.cameras.list.length") == 4)
@@ -134,6 +134,48 @@ def test_whose_poses_are_read_is_chosen_where_several_programs_left_some(visitor
     select.select_option("the file that train reads by itself")
     tab.get_by_text("Poses of OpenSfM: 6 of 6 photos").wait_for()
     assert select.is_hidden() and not (folder / CHOSEN).exists()
+
+
+def test_a_colmap_model_is_chosen_before_a_transforms_json(visitor, library):
+    """The list names programs; a path is only in an option's tooltip."""
+    folder = library[0].library.root / "captures" / "two"
+    views, points, colors = procedural_capture(48, 6)
+    write_transforms(folder, views)
+    write_colmap(folder, views[:4], points, colors)
+    tab = go(visitor().tab, "captures/two")
+    select = tab.get_by_label("Cameras from")
+    select.wait_for()
+    assert select.locator("option").all_inner_texts()[1:] == ["transforms.json", "COLMAP"]
+    until_in(tab, capture_frame(tab, "two"), "viewer.cameras.list.length === 6")
+    select.select_option("COLMAP")
+    awaited(tab, lambda: capture_frame(tab, "two").evaluate("viewer.cameras.list.length") == 4)
+    assert (folder / CHOSEN).read_text() == "sparse/0/images.bin\n"
+    write_colmap(folder / "colmap", views[:5], points, colors)
+    tab.reload()
+    select.locator("option").nth(3).wait_for(state="attached")
+    assert select.locator("option").all_inner_texts()[2:] == ["COLMAP (1 of 2)", "COLMAP (2 of 2)"]
+    assert select.input_value() == "sparse/0/images.bin"
+
+
+def test_models_of_colmap_can_be_chosen(page, studio):
+    folder = studio.library.root / "captures" / "two"
+    views, points, colors = procedural_capture(48, 6)
+    write_transforms(folder, views)
+    write_colmap(folder, views[:4], points, colors)
+    address = "/api/captures/two/poses"
+    files = [
+        {"file": "transforms.json", "program": "transforms.json"},
+        {"file": "sparse/0/images.bin", "program": "COLMAP"},
+    ]
+    assert page.get(address).json() == {"files": files, "chosen": None, "lost": False}
+    assert page.post(address, json={"file": "sparse/0/images.bin"}).status_code == 200
+    assert page.get(address).json()["chosen"] == "sparse/0/images.bin"
+    assert "using the poses of transforms.json" not in page.get("/api/captures/two/notes").text
+    for wrong in ("sparse/0", "sparse/0/cameras.bin", "sparse/1/images.bin"):
+        assert page.post(address, json={"file": wrong}).status_code == 400
+    (folder / "transforms.json").unlink()
+    assert page.post(address, json={"file": ""}).status_code == 200
+    assert page.get(address).json() == {"files": [], "chosen": None, "lost": False}
 
 
 def test_only_files_with_poses_can_be_chosen(page, studio):

@@ -147,6 +147,9 @@ SCENE_SUFFIXES: Final = (
 )
 """Suffixes of the files that can hold a scene. Source: ours."""
 
+POINT_SUFFIXES: Final = (".las", ".laz")
+"""Suffixes of the point clouds that `convert` makes of a scene's centres; they hold no scene. Source: ours."""
+
 SIZED: Final = (".spz", ".sog", ".compressed.ply", ".html")
 """Endings of the files that `convert --size` writes. Source: ours."""
 

@@ -139,7 +139,7 @@ def _write(
         export.write(arguments.out, source, tour, options)
     else:
         export.write_refined(arguments.out, source, options, arguments.lod_refine, backend, say)
-    return None
+    return export.POINTS if export.is_points(arguments.out) else None
 
 
 def _write_sized(
@@ -230,6 +230,10 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ArgumentError(
             f"--surface: only a page can show a mesh; {arguments.out} is not a page, use {export.PAGE}"
         )
+    if arguments.verify and export.is_points(arguments.out):
+        raise ArgumentError(
+            f"--verify: {arguments.out} is a point cloud, which has no renders to compare; omit it"
+        )
     _check_refining(arguments)
 
 
@@ -308,7 +312,11 @@ def _joined(sources: Sequence[Source]) -> Source:
 
 def _origin(source: Source, out: Path) -> list[str]:
     """Say where a file keeps the origin of its coordinates."""
-    if source.origin == ORIGIN or any("origin" in loss for loss in export.losses(out, source)):
+    if (
+        source.origin == ORIGIN
+        or export.is_points(out)
+        or any("origin" in loss for loss in export.losses(out, source))
+    ):
         return []
     where = ", ".join(f"{x:.15g}" for x in source.origin)
     return [f"coordinates are relative to the origin ({where}), which {out.name} stores in double"]

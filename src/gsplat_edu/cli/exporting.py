@@ -39,7 +39,7 @@ def export_all(
 ) -> list[dict[str, Any]]:
     """Write a scene to every path, check each file, and return the entries for metrics.json.
 
-    Each file is written and checked once no other command writes it.
+    Each file is written and checked once no other command writes it. Point clouds are not checked and have no entry.
     """
     written = []
     for path in paths:
@@ -48,6 +48,9 @@ def export_all(
         with locked_file("--export", path, "gsplat-edu train", say, PATIENCE):
             export.write(path, source)
             emitter.report_output(path)
+            if export.is_points(path):
+                say(f"wrote {path}: {export.POINTS}")
+                continue
             written.append(check_and_say(path, source, backend, bar, say).document())
     return written
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -132,16 +133,22 @@ def is_folder(path: Path) -> bool:
 POSE_PLACES = ("opensfm", "opf", "pose", "EXR_RGBD", "keyframes/corrected_cameras", "keyframes/cameras")
 """Folders in a capture where programs write their poses."""
 
+MODEL_PLACE = re.compile(r"(?:/colmap)?/sparse(?:/[0-9]+)?\Z|/[0-9]+\Z")
+"""The end of the path of a COLMAP model that is not the folder of its capture."""
+
 
 def capture_folder(path: Path) -> Path:
     """Return the folder of a capture that is given by its folder or by its file with poses.
 
     Args:
-        path: The folder, or a file in it or in one of `POSE_PLACES`; transforms.json and Blender's are in it.
+        path: The folder, or a file in it or in one of `POSE_PLACES`; transforms.json and Blender's are in it; the list
+            of images of a COLMAP model is where COLMAP puts models.
     """
     if is_folder(path):
         return path
     folder = path.parent.absolute()
+    if path.stem == "images":
+        return folder if is_folder(folder / "images") else Path(MODEL_PLACE.sub("", folder.as_posix()))
     for place in () if path.name.startswith("transforms") else POSE_PLACES:
         depth = place.count("/")
         if folder.as_posix().endswith(f"/{place}"):

@@ -12,7 +12,9 @@ from typing import NamedTuple
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.reading import read_text
+from gsplat_edu.data.blender import TRAIN_FILE
 from gsplat_edu.data.capture import is_file, is_folder
+from gsplat_edu.data.colmap import image_lists
 from gsplat_edu.data.readers.programs import pose_files
 
 CHOSEN = "chosen_poses.txt"
@@ -20,6 +22,9 @@ CHOSEN = "chosen_poses.txt"
 
 TRANSFORMS = "transforms.json"
 """A file with poses that belongs to no other program."""
+
+COLMAP = "COLMAP"
+"""The program whose model is chosen by the file that lists its images."""
 
 
 class PoseChoice(NamedTuple):
@@ -40,11 +45,11 @@ def pose_choices(capture: Path) -> list[PoseChoice]:
     Args:
         capture: The capture's folder.
     """
-    own = [PoseChoice(TRANSFORMS, TRANSFORMS)] if is_file(capture / TRANSFORMS) else []
-    return own + [
-        PoseChoice(found.path.relative_to(capture).as_posix(), found.program.name)
-        for found in pose_files(capture)
-    ]
+    files = [(capture / TRAIN_FILE, "Blender"), (capture / TRANSFORMS, TRANSFORMS)]
+    files = [(path, program) for path, program in files if is_file(path)]
+    files += [(path, COLMAP) for path in image_lists(capture)]
+    files += [(found.path, found.program.name) for found in pose_files(capture)]
+    return [PoseChoice(path.relative_to(capture).as_posix(), program) for path, program in files]
 
 
 def chosen_poses(capture: Path) -> Path:

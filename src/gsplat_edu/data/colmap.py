@@ -71,23 +71,45 @@ capture itself are searched."""
 
 SUFFIXES = (".bin", ".txt")
 
+LISTS = tuple(f"images{suffix}" for suffix in SUFFIXES)
+"""Names of the file in a model that lists its images."""
 
-def find_model(folder: Path) -> Path | None:
+
+def find_model(path: Path) -> Path | None:
     """Find the folder of a model, by its cameras or images file; of numbered ones the one with the most images.
 
     A mapper writes a numbered model for each group of photos that it could connect. Of equal ones, the first is found.
 
     Args:
-        folder: The capture, its folder of models, or the model.
+        path: The capture, its folder of models, or the model; or the file in a model that lists its images.
     """
-    places = [folder / place for place in PLACES]
-    for parent in (folder / "sparse", folder / "colmap" / "sparse", folder):
-        places += _numbered(parent)
-    found = next(filter(_is_model, places), None)
-    if found is None or found == folder or not found.name.isdecimal():
+    if is_file(path):
+        return path.parent if path.name in LISTS else None
+    found = next(iter(_models(path)), None)
+    if found is None or found == path or not found.name.isdecimal():
         return found
     beside = [place for place in _numbered(found.parent) if _is_model(place)]
     return found if beside == [found] else max(beside, key=lambda place: _image_count(place) or 0)
+
+
+def image_lists(folder: Path) -> list[Path]:
+    """Return the file that lists the images of each model in a capture.
+
+    Args:
+        folder: The capture.
+    """
+    return [listed for model in _models(folder) if (listed := _image_list(model)) is not None]
+
+
+def _models(folder: Path) -> list[Path]:
+    places = [folder / place for place in PLACES]
+    for parent in (folder / "sparse", folder / "colmap" / "sparse", folder):
+        places += _numbered(parent)
+    return [place for place in dict.fromkeys(places) if _is_model(place)]
+
+
+def _image_list(model: Path) -> Path | None:
+    return next((model / name for name in LISTS if is_file(model / name)), None)
 
 
 def _is_model(place: Path) -> bool:

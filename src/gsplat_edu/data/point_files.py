@@ -32,7 +32,8 @@ class PointFile:
         points: (N, 3) in the file's units, including NaN and infinity.
         colors: (N, 3) 0 to 1; None if the file has none.
         scan: Whether the file is of a format of scanners, and not a PLY.
-        crs: Code of the coordinate reference system that a LAS or LAZ names; None if it names none, or as words only.
+        crs: Code of the coordinate reference system that a LAS, LAZ or E57 names; None if it names none, or as words
+            only.
     """
 
     points: Points
@@ -61,12 +62,12 @@ def read_points(path: Path) -> PointFile:
     except (OSError, ValueError) as error:  # ValueError: invalid file name
         reason = getattr(error, "strerror", None) or str(error)
         raise DatasetError(f"{path}: cannot be read ({reason}); give a point cloud") from None
-    for read, is_own in READERS:
+    for read, is_own, system in READERS:
         if is_own(start):
             points, colors = read(path)
             if not len(points):
                 raise DatasetError(f"{path}: holds no points; export the scan again")
-            return PointFile(points, colors, True, _las_system(path) if read is _read_las else None)
+            return PointFile(points, colors, True, _code(system, path))
     return PointFile(*read_ply(path), False)
 
 
@@ -90,17 +91,10 @@ def _read_las(path: Path) -> tuple[Points, Points | None]:
     return _joined(points, colors)
 
 
-def _las_system(path: Path) -> str | None:
-    """Return the code of a file's system, with that of its heights; None without one, or without pyproj to read it."""
+def _las_system(path: Path) -> Any:  # noqa: ANN401
+    """Return the system of a LAS as pyproj's object; None without one."""
     with _library("laspy", path).open(path) as file:
-        try:
-            system = file.header.parse_crs()
-        except Exception:  # without pyproj, or of a text that it does not know: many errors of two packages
-            return None
-    if system is None:
-        return None
-    codes = [part.to_epsg() for part in system.sub_crs_list or [system]]
-    return None if None in codes else "EPSG:" + "+".join(map(str, codes))
+        return file.header.parse_crs()
 
 
 def _read_e57(path: Path) -> tuple[Points, Points | None]:
@@ -120,6 +114,26 @@ def _read_e57(path: Path) -> tuple[Points, Points | None]:
     except Exception as error:  # libE57Format's errors are plain exceptions
         raise _damaged(path, "E57", error) from None
     return _joined(points, colors)
+
+
+def _e57_system(path: Path) -> Any:  # noqa: ANN401
+    """Return the system of an E57, whose header has it as well-known text, as pyproj's object; None without one."""
+    with _library("pye57", path).E57(str(path)) as file:
+        name = "coordinateMetadata"
+        text = file.root[name].value() if file.root.isDefined(name) else ""
+    return importlib.import_module("pyproj").CRS.from_wkt(text) if text.strip() else None
+
+
+def _code(system_of: Callable[[Path], Any], path: Path) -> str | None:
+    """Return the code of a file's system, with that of its heights; None without one, or without pyproj to read it."""
+    try:
+        system = system_of(path)
+    except Exception:  # without pyproj, or of a text that it does not know: many errors of three packages
+        return None
+    if system is None:
+        return None
+    codes = [part.to_epsg() for part in system.sub_crs_list or [system]]
+    return None if None in codes else "EPSG:" + "+".join(map(str, codes))
 
 
 def _step(count: int) -> int:
@@ -209,12 +223,14 @@ def _is_pcd(start: bytes) -> bool:
     return start.startswith(b"# .PCD") or (start.startswith(b"VERSION") and b"FIELDS" in start)
 
 
-READERS: tuple[tuple[Callable[[Path], tuple[Points, Points | None]], Callable[[bytes], bool]], ...] = (
-    (_read_las, lambda start: start.startswith(b"LASF")),
-    (_read_e57, lambda start: start.startswith(b"ASTM-E57")),
-    (_read_pcd, _is_pcd),
+Reader = Callable[[Path], tuple[Points, Points | None]]
+
+READERS: tuple[tuple[Reader, Callable[[bytes], bool], Callable[[Path], Any]], ...] = (
+    (_read_las, lambda start: start.startswith(b"LASF"), _las_system),
+    (_read_e57, lambda start: start.startswith(b"ASTM-E57"), _e57_system),
+    (_read_pcd, _is_pcd, lambda path: None),
 )
-"""What reads a format, and what recognises it by a file's first bytes. Everything else is a PLY, or an error."""
+"""What reads a format, recognises it by a file's first bytes, and reads its system. All else is a PLY, or an error."""
 
 
 def _library(name: str, path: Path) -> Any:  # noqa: ANN401

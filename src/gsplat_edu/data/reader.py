@@ -21,6 +21,7 @@ from gsplat_edu.data.capture import (
     Capture,
     Cloud,
     Frame,
+    capture_folder,
     entries,
     is_file,
     is_folder,
@@ -128,6 +129,9 @@ def read_capture(path: Path) -> Capture:
         reader: Reader = plugins("readers")[foreign]
         return reader.read(path)
     path = chosen_poses(path)
+    if is_file(path) and (model := find_model(path)) is not None:
+        folder = capture_folder(path)
+        return replace(read_colmap(folder, model), scale=read_scale(folder))
     if is_file(path) and (files := pose_files(path)):
         return read_poses(path, files)
     if path.suffix.lower() == ".json" and is_file(path):
@@ -181,6 +185,8 @@ def layout_of(path: Path) -> str | None:
         return foreign
     with contextlib.suppress(DatasetError):  # reading says what is wrong with the choice
         path = chosen_poses(path)
+    if is_file(path) and find_model(path) is not None:
+        return "COLMAP"
     if is_file(path) and (files := pose_files(path)):
         return files[0].program.name
     if path.suffix.lower() == ".json" and is_file(path):

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import unreadable, written_aside
 from gsplat_edu.base.reading import parse_json, read_text
@@ -15,6 +17,16 @@ from gsplat_edu.scene.earth import Earth
 
 SCALE_FILE = "scale.json"
 """Name of the file in a capture's folder."""
+
+
+class _Stored(msgspec.Struct):
+    """A scale as files store it; the place on earth is the text of `Earth`."""
+
+    unit: str
+    source: str
+    detail: str = ""
+    level: bool = False
+    earth: str | None = None
 
 
 @dataclass(frozen=True)
@@ -40,8 +52,24 @@ class Scale:
         return f"1 unit = 1 {self.unit}, from {self.source}" + f" ({self.detail})" * bool(self.detail)
 
     def json(self) -> dict[str, Any]:
-        """Return the fields as JSON values."""
-        return asdict(self)
+        """Return the fields as JSON values, the place on earth as text."""
+        return asdict(self) | {"earth": None if self.earth is None else str(self.earth)}
+
+    @classmethod
+    def parsed(cls, where: str, value: object) -> Scale | None:
+        """Return the scale that `json` described; None for None.
+
+        Args:
+            where: Its place in the file; empty for the whole file.
+            value: The JSON.
+
+        Raises:
+            ArgumentError: a field has another type, or the place on earth is malformed.
+        """
+        stored: _Stored | None = record_of(where, value, _Stored | None)
+        if stored is None:
+            return None
+        return cls(stored.unit, stored.source, stored.detail, stored.level, Earth.parsed(stored.earth))
 
 
 def read_scale(folder: Path) -> Scale | None:
@@ -57,12 +85,11 @@ def read_scale(folder: Path) -> Scale | None:
     if not path.is_file():
         return None
     try:
-        scale: Scale | None = record_of("", parse_json(read_text(path)), Scale | None)
+        return Scale.parsed("", parse_json(read_text(path)))
     except OSError as error:
         raise DatasetError(unreadable(path, error)) from None
     except ValueError as error:
         raise DatasetError(f"{path}: is damaged ({error}); remove it, or make the capture again") from None
-    return scale
 
 
 def write_scale(folder: Path, scale: Scale) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64
 
 from gsplat_edu.base.text import legible
 from gsplat_edu.data.capture import is_file
+from gsplat_edu.data.chosen_poses import chosen_poses
 from gsplat_edu.data.colmap import SUFFIXES, find_model, points_file
 from gsplat_edu.data.colmap_files import (
     Tracked,
@@ -57,7 +58,7 @@ def tracked_points(
     Raises:
         DatasetError: a file is truncated or malformed.
     """
-    model = find_model(folder)
+    model = find_model(chosen_poses(folder))
     listed = (
         None if model is None else next((f for s in SUFFIXES if is_file(f := model / f"images{s}")), None)
     )

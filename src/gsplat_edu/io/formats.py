@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from gsplat_edu.base.constants import RUN_CONFIG, SH_MAX_DEGREE
+from gsplat_edu.base.constants import POINT_SUFFIXES, RUN_CONFIG, SH_MAX_DEGREE
 from gsplat_edu.base.errors import ArgumentError, SceneFormatError
 from gsplat_edu.base.plugins import plugins
 from gsplat_edu.base.validation import of_type
@@ -59,9 +59,11 @@ FORMATS: tuple[Format, ...] = (
     Format(".usdz", "gsplat_edu.io.usd", "USD's package"),
     Format(".rad", "gsplat_edu.io.rad", "Spark's RAD"),
     Format(".csv", "gsplat_edu.io.csv", "CSV of splats", metadata=False),
+    Format(".las", "gsplat_edu.io.las", "LAS of centres", sh_degree=0),
+    Format(".laz", "gsplat_edu.io.las", "compressed LAS of centres", sh_degree=0),
     *plugins("formats").values(),
 )
-"""The first matching suffix wins; those of plug-ins come last."""
+"""The first matching suffix wins; those of plug-ins come last. Those in `POINT_SUFFIXES` can only be written."""
 
 SOG_META = "meta.json"
 """File that represents a SOG stored as a folder."""
@@ -114,6 +116,9 @@ def stored_bytes(path: Path) -> int:
 def losses(path: str | Path, scene: Scene) -> list[str]:
     """List the parts of a scene that the format of a path cannot store, one sentence each."""
     found, degree = format_of(path), scene.gaussians.sh_degree
+    if found.suffix in POINT_SUFFIXES:
+        of_points: list[str] = importlib.import_module(found.module).losses(path, scene)
+        return of_points
     said = []
     if degree > found.sh_degree:
         said.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsplat_edu.base.constants import SCENE_SUFFIXES, SH_MAX_DEGREE, SIZED
+from gsplat_edu.base.constants import POINT_SUFFIXES, SCENE_SUFFIXES, SH_MAX_DEGREE, SIZED
 from gsplat_edu.base.errors import ArgumentError, DatasetError
 from gsplat_edu.base.validation import in_range, whole_number
 from gsplat_edu.options.values import (
@@ -64,8 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="OUT",
         help=f"file to write; its suffix selects the format: {', '.join(SCENE_SUFFIXES)} or .html (a page that shows"
-        " the scene); .usdc needs the extra usd; FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json levels"
-        " of detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
+        f" the scene); {' and '.join(POINT_SUFFIXES)} are point clouds of the splats' centres; .usdc needs the extra"
+        " usd, point clouds the extra scans; FOLDER/meta.json writes an unzipped SOG, FOLDER/lod-meta.json levels of"
+        " detail (streamed SOG), FOLDER/tileset.json 3D Tiles for Cesium",
     )
     parser.add_argument("--merge", action="store_true", help="join several scenes into one")
     _add_filters(parser)

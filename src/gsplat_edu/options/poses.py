@@ -18,8 +18,8 @@ def add_poses(group: argparse._ActionsContainer) -> None:
         "--poses",
         type=Path,
         metavar="FILE",
-        help="read the poses of this file in the capture's folder, such as cameras.xml (default: a COLMAP model or"
-        " transforms.json, else the file that poses the most photos)",
+        help="read the poses of this file in the capture's folder, such as cameras.xml or sparse/1/images.bin (default:"
+        " transforms.json or a COLMAP model, else the file that poses the most photos)",
     )
 
 

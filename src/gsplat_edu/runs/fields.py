@@ -30,7 +30,7 @@ CONFIG = _fields(
     plugins=dict[str, str],
     digests=dict[str, str],
     origin=Place,
-    scale=_fields(unit=str, source=str, detail=str, earth=_fields(crs=str, matrix=list[Number])),
+    scale=_fields(unit=str, source=str, detail=str, earth=str),
     data=_fields(path=str),
     train=_fields(iterations=Whole, strategy=str),
     photos=_fields(unposed=Whole, gap=tuple[str, str], hole=bool),

@@ -12,7 +12,6 @@ import numpy as np
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError, CheckpointError
-from gsplat_edu.base.records import record_of
 from gsplat_edu.data.dataset import Dataset
 from gsplat_edu.io.formats import file_in, read_scene
 from gsplat_edu.io.scene import Scene, direction
@@ -171,10 +170,9 @@ def run_earth(folder: RunFolder, config: Mapping[str, Any]) -> Earth | None:
         CheckpointError: the file has no usable place.
     """
     try:
-        earth: Earth | None = record_of("", (config.get("scale") or {}).get("earth"), Earth | None)
+        return Earth.parsed((config.get("scale") or {}).get("earth"))
     except ArgumentError as error:
         raise CheckpointError(f"{folder.config}: {error}; fix the file") from None
-    return earth
 
 
 def up_and_unit(config: Mapping[str, Any], cameras: Sequence[Camera]) -> tuple[Vector, str | None]:

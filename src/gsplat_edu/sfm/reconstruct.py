@@ -22,7 +22,6 @@ from jaxtyping import Float64
 from gsplat_edu.base.constants import AUTO
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.files import remove_leftovers
-from gsplat_edu.base.records import record_of
 from gsplat_edu.data.notes import UnreadColors
 from gsplat_edu.data.scale import Scale
 from gsplat_edu.io.edit import Similarity
@@ -564,7 +563,7 @@ class _Run:
             self.whole,
         )
         publish(self.folder, self.options.out)
-        if scale := record_of("scale", facts["scale"], Scale | None):
+        if scale := Scale.parsed("scale", facts["scale"]):
             self._say(f"scale: {scale}")
         if self.panoramas is not None:
             names = {face: one.name for one in self.panoramas for face in one.faces}

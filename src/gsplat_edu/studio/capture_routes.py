@@ -88,18 +88,16 @@ def _change_region(studio: Studio, request: Request, body: Any) -> dict[str, Any
 
 def _poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401
     from gsplat_edu.data.chosen_poses import CHOSEN, chosen_poses, pose_choices
-    from gsplat_edu.data.colmap import find_model
 
     entry = studio.library.entry("captures", request.path_params["name"])
     files = [{"file": file, "program": program} for file, program in pose_choices(entry)]
-    has_choice = len(files) + (find_model(entry) is not None) > 1
     chosen, is_lost = None, False
     if (entry / CHOSEN).is_file():
         try:
             chosen = chosen_poses(entry).relative_to(entry).as_posix()
         except DatasetError:
             is_lost = True
-    return {"files": files if has_choice or is_lost else [], "chosen": chosen, "lost": is_lost}
+    return {"files": files if len(files) > 1 or is_lost else [], "chosen": chosen, "lost": is_lost}
 
 
 def _choose_poses(studio: Studio, request: Request, body: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -13,7 +13,7 @@ from typing import Any
 
 from msgspec import structs
 
-from gsplat_edu.base.constants import SCENE_SUFFIXES
+from gsplat_edu.base.constants import POINT_SUFFIXES, SCENE_SUFFIXES
 from gsplat_edu.base.errors import ArgumentError, SplatError
 from gsplat_edu.base.text import as_file_name, legible, option_flag, shortened
 from gsplat_edu.jobs.record import Purpose, Rendered, Work
@@ -28,7 +28,7 @@ from gsplat_edu.studio.names import LONGEST_FILE, checked_name
 EDITS = "edits.json"
 """File of an entry with the edits of its scene."""
 
-FORMATS = (*(suffix.removeprefix(".") for suffix in SCENE_SUFFIXES), "html")
+FORMATS = (*(suffix.removeprefix(".") for suffix in (*SCENE_SUFFIXES, *POINT_SUFFIXES)), "html")
 """Endings of exported scenes."""
 
 SURFACE, COLLIDER = "mesh.glb", "collider.glb"
@@ -237,7 +237,8 @@ def _clean(asked: _Asked) -> Line:
 
 def _convert(asked: _Asked) -> Line:
     line = [asked.scene(), asked.exported(), *asked.options(), *asked.edits(), *asked.meshes()]
-    return line if "verify" in asked.work.options else [*line, "--verify"]
+    is_points = asked.work.outputs[0].endswith(POINT_SUFFIXES)
+    return line if is_points or "verify" in asked.work.options else [*line, "--verify"]
 
 
 def _render(asked: _Asked) -> Line:

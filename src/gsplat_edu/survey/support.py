@@ -9,6 +9,7 @@ from pathlib import Path
 from gsplat_edu.base.errors import DatasetError
 from gsplat_edu.base.reading import open_file
 from gsplat_edu.base.text import legible
+from gsplat_edu.data.chosen_poses import chosen_poses
 from gsplat_edu.data.colmap import find_model
 from gsplat_edu.data.colmap_files import observations_bin, observations_txt
 
@@ -20,19 +21,17 @@ def observed_points(capture: Path) -> dict[str, int]:
     """Count the points that COLMAP observed in each photo.
 
     Args:
-        capture: Folder with a COLMAP model.
+        capture: Folder with a COLMAP model, or the file that lists the model's images.
 
     Returns:
-        Counts by frame name; empty if there is no model, it cannot be read, or its tracks were computed from the poses
+        Counts by frame name; empty if no model is read, it cannot be read, or its tracks were computed from the poses
         (`gsplat_edu.data.tracks`), so that they are no evidence for them.
     """
-    model = find_model(capture)
-    if model is None:
-        return {}
-    listed = model / "images.bin"
     try:
-        if not _is_measured(model):
+        model = find_model(chosen_poses(capture))
+        if model is None or not _is_measured(model):
             return {}
+        listed = model / "images.bin"
         images = observations_bin(listed) if listed.is_file() else observations_txt(model / "images.txt")
         return {legible(image.name): len(image.points) for image in images}
     except (OSError, ValueError, IndexError, struct.error, DatasetError):

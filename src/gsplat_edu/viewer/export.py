@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from gsplat_edu.base.constants import POINT_SUFFIXES
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.files import check_folder
 from gsplat_edu.evaluate.fidelity import compare_scenes
 from gsplat_edu.evaluate.metrics import ImageScore, summarize, worst
-from gsplat_edu.io import formats
+from gsplat_edu.io import formats, las
 from gsplat_edu.io.formats import (
     FORMATS,
     LOD_FORMATS,
@@ -43,6 +44,9 @@ VEIL = (
 
 PAGE = ".html"
 """Suffix of the HTML page that renders a scene in a browser."""
+
+POINTS = "the centres of the splats as points"
+"""What a point cloud contains, in words."""
 
 VIEWS = 8
 """Number of cameras used to check a file."""
@@ -104,9 +108,16 @@ def check_target(name: str, path: Path) -> None:
             raise ArgumentError(f"{name}: {path}: unknown scene format; known are {known}") from None
     if path.suffix.lower() == ".usdc":
         require_usd(f"{name}: {path}")
+    if is_points(path):
+        las.require_laspy(f"{name}: {path}")
     if path.is_dir():
         raise ArgumentError(f"{name}: {path} is a folder; give a file name")
     check_folder(name, path.parent)
+
+
+def is_points(path: Path) -> bool:
+    """Return whether a path denotes a point cloud, which cannot be rendered or read back as a scene."""
+    return path.suffix.lower() in POINT_SUFFIXES
 
 
 def has_levels(path: Path) -> bool:
@@ -202,7 +213,7 @@ def losses(path: Path, source: Source) -> list[str]:
     """List the parts of a scene that the format of a path cannot store, one sentence each."""
     if path.suffix.lower() == PAGE:
         return []
-    veiled = through_lenses(camera for _, camera in source.cameras)
+    veiled = not is_points(path) and through_lenses(camera for _, camera in source.cameras)
     return [*formats.losses(path, source.scene), *([VEIL] if veiled else [])]
 
 

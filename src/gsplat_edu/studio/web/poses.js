@@ -33,9 +33,11 @@ export function poses(entry, chosen) {
     ({ files, chosen: file, lost }) => {
       element.hidden = !files.length;
       const usual = want("option", { value: "" }, "the file that train reads by itself");
-      const options = files.map(({ file: value, program }) =>
-        want("option", { value }, value === program ? value : `${program}: ${value}`),
-      );
+      const options = files.map(({ file: value, program }) => {
+        const same = files.filter((other) => other.program === program).map((other) => other.file);
+        const which = same.length > 1 ? ` (${same.indexOf(value) + 1} of ${same.length})` : "";
+        return want("option", { value, title: value }, `${program}${which}`);
+      });
       patch(select, [usual, ...options]);
       select.value = file ?? "";
       if (lost) select.selectedIndex = -1;

@@ -31,6 +31,7 @@ const FORMATS = [
   ["compressed.ply", "Compressed PLY", "a quarter of a PLY; for SuperSplat"],
   ["splat", "SPLAT", "without view-dependent colour"],
   ["glb", "GLB", "glTF with Gaussians"],
+  ["laz", "LAZ", "the splats' centres as a point cloud; for CloudCompare, QGIS and CAD"],
 ];
 
 const [SAME, CLOSE] = [40, 30]; // dB: root mean square differences of 1 % and of 3 % of the whole range
