@@ -265,6 +265,10 @@ def test_relocation(least):
         assert_close(moved[k], scales[k] * factor, 1e-11)
     if least == 0.005:
         assert torch.equal(compat.compute_relocation(opacities, scales, ratios, binoms)[1], moved)
+    column, with_column = compat.compute_relocation(
+        opacities[:, None], scales, ratios, binoms, min_opacity=least
+    )
+    assert torch.equal(column, found[:, None]) and torch.equal(with_column, moved)  # splatfacto's opacities
     with pytest.raises(ArgumentError, match="^min_opacity: "):
         compat.compute_relocation(opacities, scales, ratios, binoms, min_opacity=1.5)
     clamped = compat.compute_relocation(opacities, scales, ratios * 0 + 1000, binoms)

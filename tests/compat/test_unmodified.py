@@ -1,6 +1,7 @@
 """Code that imports gsplat and asks for "cuda" runs as it is after `install()`; `uninstall()` reverts that."""
 
 import sys
+import threading
 from types import ModuleType
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 import gsplat_edu.compat.gsplat as ours
 from gsplat_edu import ArgumentError
 from gsplat_edu.compat import install, uninstall
+from gsplat_edu.compat.unmodified import _PATCHES
 from processes import Program
 
 SCRIPT = """
@@ -176,10 +178,70 @@ def test_cuda_means_the_cpu_everywhere(installed, tmp_path):
     assert x.to(torch.float64).dtype == torch.float64 and x.reshape(2, 1).shape == (2, 1)
 
 
+def test_a_module_goes_to_a_numbered_device(installed):
+    linear = torch.nn.Linear(2, 2)
+    assert linear.to(0) is linear and linear.to(device=1).weight.device.type == "cpu"
+    assert linear.to("cuda:0", torch.float64).weight.dtype == torch.float64
+
+
+def test_generators_of_cuda_are_the_cpus(installed):
+    for device in ("cuda", torch.device("cuda:1"), 0):
+        seeded = torch.Generator(device).manual_seed(3)
+        assert isinstance(seeded, torch.Generator) and seeded.device.type == "cpu"
+        drawn = torch.rand(4, generator=seeded, device="cuda")
+        assert torch.equal(drawn, torch.rand(4, generator=torch.Generator(device="cpu").manual_seed(3)))
+    assert isinstance(torch.default_generator, torch.Generator) and not isinstance(3, torch.Generator)
+
+
+def test_questions_about_the_gpu_have_answers(installed):
+    assert torch.cuda.max_memory_allocated() == torch.cuda.memory_allocated(0) == 0
+    torch.cuda.set_device(1)
+    torch.cuda.reset_peak_memory_stats()
+    with torch.cuda.device(torch.cuda.current_device()):
+        assert torch.ones(2).to(torch.cuda.current_device()).device.type == "cpu"
+
+
+class Subclassed(threading.Thread):
+    """Does its work as a viewer's renderer does: in `run`."""
+
+    def run(self):
+        self.made = torch.ones(2, device="cuda")
+
+
+def test_threads_that_are_started_afterwards_have_the_same_devices(installed):
+    made = []
+    threads = [Subclassed(), threading.Thread(target=lambda: made.append(torch.zeros(2).to(0)))]
+    for thread in threads:
+        thread.start()
+        thread.join(timeout=60)
+    assert [tensor.device.type for tensor in (threads[0].made, *made)] == ["cpu", "cpu"]
+
+
+class Numbers(torch.utils.data.Dataset):
+    """Makes its tensors on "cuda", in the loader's processes."""
+
+    def __len__(self):
+        return 6
+
+    def __getitem__(self, index):
+        return {"value": torch.tensor(float(index), device="cuda", pin_memory=False)}
+
+
+@pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true")
+def test_a_loader_with_processes_and_pinned_memory_runs(installed):
+    order = torch.Generator("cuda").manual_seed(1)
+    loader = torch.utils.data.DataLoader(
+        Numbers(), batch_size=2, num_workers=2, pin_memory=True, shuffle=True, generator=order
+    )
+    values = torch.cat([batch["value"].to("cuda") for batch in loader])
+    assert values.sort().values.tolist() == [0, 1, 2, 3, 4, 5]
+    assert torch.zeros(1, pin_memory=True).device.type == "cpu"
+
+
 def test_uninstall_reverts_everything(capsys):
     gsplat = pytest.importorskip("gsplat.strategy.ops", reason="gsplat is not installed (extra dev)")
     before = {name: dict(vars(module)) for name, module in sys.modules.items() if name.startswith("gsplat.")}
-    functions = torch.load, torch.cuda.synchronize, torch.set_default_device
+    functions = [getattr(owner, name) for owner, name, _ in _PATCHES]
     install()
     install()  # changes nothing
     assert gsplat.compute_relocation is ours.compute_relocation
@@ -190,7 +252,7 @@ def test_uninstall_reverts_everything(capsys):
     for name, names in before.items():
         for key, value in names.items():
             assert key == "__builtins__" or getattr(sys.modules[name], key) is value, (name, key)
-    assert functions == (torch.load, torch.cuda.synchronize, torch.set_default_device)
+    assert functions == [getattr(owner, name) for owner, name, _ in _PATCHES]
     if not torch.cuda.is_available():
         with pytest.raises((AssertionError, RuntimeError)):
             torch.zeros(1, device="cuda")

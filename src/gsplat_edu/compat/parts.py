@@ -162,14 +162,14 @@ def compute_relocation(
     o' is clamped to [min_opacity, 1 - 2^-23] before the scales are computed, as in gsplat 1.6.0.
 
     Args:
-        opacities: (N,) 0 to 1.
+        opacities: (N,) or (N, 1) 0 to 1.
         scales: (N, 3) standard deviations.
         ratios: (N,) n, clamped to 1 and to the size of the table. Unlike gsplat's, this function does not change it.
         binoms: (n_max, n_max) binomial coefficients C(row, column), 0 above the diagonal.
         min_opacity: Smallest new opacity, 0 to 1. 0 is the formula of gsplat 1.5.3.
 
     Returns:
-        New opacities (N,) and scales (N, 3), of the dtype of `opacities`.
+        New opacities, of the shape of `opacities`, and scales (N, 3), of the dtype of `opacities`.
 
     Raises:
         ShapeError: a shape differs.
@@ -179,7 +179,7 @@ def compute_relocation(
     """
     real_tensor("opacities", opacities)
     N = len(opacities) if opacities.ndim else 0
-    expect("opacities", opacities, (N,), opacities)
+    expect("opacities", opacities, (N, 1) if opacities.ndim == 2 else (N,), opacities)
     expect("scales", scales, (N, 3), opacities, "opacities")
     in_range("min_opacity", min_opacity, 0.0, OPACITY_LIMIT)
     sizes = {"N": N}
@@ -191,7 +191,7 @@ def compute_relocation(
     if not n_max:
         raise ArgumentError("binoms: is empty, but has to hold C(0, 0)")
     n = ratios.double().clamp(1, n_max).long()
-    old = opacities.double()
+    old = opacities.double().reshape(N)
     new = (1.0 - (1.0 - old) ** (1.0 / n.double())).clamp(min_opacity, OPACITY_LIMIT)
     # sums over i = 1..n of C(i-1, k): a row for each n
     counts = binoms.double().cumsum(dim=0)[n - 1]
@@ -201,4 +201,4 @@ def compute_relocation(
     factor = torch.where(
         total > 0, old / torch.where(total > 0, total, 1.0), 1.0
     )  # nothing to share: as it was
-    return new.to(opacities.dtype), (factor[:, None] * scales.double()).to(opacities.dtype)
+    return new.to(opacities.dtype).view_as(opacities), (factor[:, None] * scales.double()).to(opacities.dtype)

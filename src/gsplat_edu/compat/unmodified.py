@@ -11,7 +11,8 @@ Two things are changed in this process, and `uninstall` reverts both.
   modules of its names are registered with what we export; a name that only gsplat has is an error that says so.
 - **Devices.** A `TorchFunctionMode` turns CUDA devices in the arguments of torch's functions into the CPU; `.cuda()`
   and `.pin_memory()` return the tensor itself. Torch keeps such modes for each thread: this one works in the thread
-  that calls `install`. `torch.cuda.is_available()` does not change. `_PATCHES` has what does not pass through modes.
+  that calls `install`, in the threads that are started afterwards, and in processes that are forked, such as those of
+  a `DataLoader`. `torch.cuda.is_available()` does not change. `_PATCHES` has what does not pass through modes.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ import importlib
 import importlib.util
 import re
 import sys
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
@@ -103,6 +105,7 @@ class _ToCpu(TorchFunctionMode):
             return args[0]
         numbered = func is torch.Tensor.to
         mapped = {name: _on_cpu(value, name == "device") for name, value in (kwargs or {}).items()}
+        mapped.pop("pin_memory", None)
         return func(*(_on_cpu(value, numbered) for value in args), **mapped)
 
 
@@ -116,29 +119,62 @@ def _on_cpu(value: Any, numbered: bool = False) -> Any:  # noqa: ANN401
 
 
 def _with_cpu(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a function whose devices torch does not pass through modes."""
+    """Wrap a function whose devices torch does not pass through modes; a whole number in its arguments is a device."""
 
     def call(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        return function(*map(_on_cpu, args), **{name: _on_cpu(value) for name, value in kwargs.items()})
+        mapped = {name: _on_cpu(value, numbered=True) for name, value in kwargs.items()}
+        return function(*(_on_cpu(value, numbered=True) for value in args), **mapped)
 
     return call
 
 
-def _does_nothing(function: Callable[..., Any]) -> Callable[..., None]:
-    """Replace a function that waits for a GPU or chooses one."""
+def _returning(result: object) -> Callable[[object], Callable[..., Any]]:
+    """Return what replaces a function that waits for a GPU, chooses or measures one by one that returns `result`."""
+    return lambda function: lambda *args, **kwargs: result
 
-    def call(*args: Any, **kwargs: Any) -> None:  # noqa: ANN401
-        pass
+
+def _with_mode(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    """Wrap `Thread.start`: the new thread has the mode as well."""
+
+    def call(thread: threading.Thread) -> None:
+        run = thread.run
+
+        def in_mode() -> None:
+            with _ToCpu():
+                run()
+
+        vars(thread)["run"] = in_mode  # also that of a subclass
+        start(thread)
 
     return call
+
+
+def _generators(original: type[torch.Generator]) -> type:
+    """Return a class that makes torch's generators on the CPU; every generator is an instance of it."""
+
+    class Kind(type):
+        def __call__(cls, device: Any = "cpu") -> torch.Generator:  # noqa: ANN401
+            return original(_on_cpu(device, numbered=True))
+
+        def __instancecheck__(cls, instance: object) -> bool:
+            return isinstance(instance, original)
+
+    return Kind("Generator", (), {})
 
 
 _PATCHES: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
     (torch, "load", _with_cpu),
     (torch, "set_default_device", _with_cpu),
-    (torch.cuda, "synchronize", _does_nothing),
-    (torch.cuda, "set_device", _does_nothing),
-    (torch.cuda, "reset_peak_memory_stats", _does_nothing),
+    (torch, "Generator", _generators),
+    (torch.nn.Module, "to", _with_cpu),
+    (torch.cuda, "synchronize", _returning(None)),
+    (torch.cuda, "set_device", _returning(None)),
+    (torch.cuda, "current_device", _returning(0)),
+    (torch.cuda, "device", _returning(nullcontext())),
+    (torch.cuda, "max_memory_allocated", _returning(0)),
+    (torch.cuda, "memory_allocated", _returning(0)),
+    (torch.cuda, "reset_peak_memory_stats", _returning(None)),
+    (threading.Thread, "start", _with_mode),
 )
 """Functions of torch that `install` replaces: owner, name, and what makes the replacement."""
 
