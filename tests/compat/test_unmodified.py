@@ -10,7 +10,7 @@ import torch
 import gsplat_edu.compat.gsplat as ours
 from gsplat_edu import ArgumentError
 from gsplat_edu.compat import install, uninstall
-from gsplat_edu.compat.unmodified import _PATCHES
+from gsplat_edu.compat.unmodified import PATCHES
 from processes import Program
 
 SCRIPT = """
@@ -241,7 +241,7 @@ def test_a_loader_with_processes_and_pinned_memory_runs(installed):
 def test_uninstall_reverts_everything(capsys):
     gsplat = pytest.importorskip("gsplat.strategy.ops", reason="gsplat is not installed (extra dev)")
     before = {name: dict(vars(module)) for name, module in sys.modules.items() if name.startswith("gsplat.")}
-    functions = [getattr(owner, name) for owner, name, _ in _PATCHES]
+    functions = [getattr(owner, name) for owner, name, _ in PATCHES]
     install()
     install()  # changes nothing
     assert gsplat.compute_relocation is ours.compute_relocation
@@ -252,7 +252,7 @@ def test_uninstall_reverts_everything(capsys):
     for name, names in before.items():
         for key, value in names.items():
             assert key == "__builtins__" or getattr(sys.modules[name], key) is value, (name, key)
-    assert functions == [getattr(owner, name) for owner, name, _ in _PATCHES]
+    assert functions == [getattr(owner, name) for owner, name, _ in PATCHES]
     if not torch.cuda.is_available():
         with pytest.raises((AssertionError, RuntimeError)):
             torch.zeros(1, device="cuda")

@@ -12,7 +12,7 @@ Two things are changed in this process, and `uninstall` reverts both.
 - **Devices.** A `TorchFunctionMode` turns CUDA devices in the arguments of torch's functions into the CPU; `.cuda()`
   and `.pin_memory()` return the tensor itself. Torch keeps such modes for each thread: this one works in the thread
   that calls `install`, in the threads that are started afterwards, and in processes that are forked, such as those of
-  a `DataLoader`. `torch.cuda.is_available()` does not change. `_PATCHES` has what does not pass through modes.
+  a `DataLoader`. `torch.cuda.is_available()` does not change. `PATCHES` has what does not pass through modes.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def install() -> None:
         found = importlib.util.find_spec("gsplat") is not None
         source = _patch_gsplat(stack) if found else _register_modules(stack)
         stack.enter_context(_ToCpu())
-        for owner, name, change in _PATCHES:
+        for owner, name, change in PATCHES:
             _set(stack, owner, name, change(getattr(owner, name)))
         _installed.append(stack.pop_all())
     complain(
@@ -162,7 +162,7 @@ def _generators(original: type[torch.Generator]) -> type:
     return Kind("Generator", (), {})
 
 
-_PATCHES: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
+PATCHES: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
     (torch, "load", _with_cpu),
     (torch, "set_default_device", _with_cpu),
     (torch, "Generator", _generators),
