@@ -28,6 +28,7 @@ import torch
 from matplotlib.colors import PowerNorm
 
 from gsplat_edu import C0, Camera, build_cov3d_batch, eval_sh, render_gaussians
+from gsplat_edu.base.constants import POINT_SUFFIXES
 from gsplat_edu.cli.sphere import Budget, SphereOptions, run_sphere
 from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.evaluate.metrics import psnr
@@ -353,6 +354,8 @@ assert wrong.mean() > 0.1
 print(f"{'file':>14}  {'bytes':>7}  per splat  PSNR against the .ply")
 kept = {}
 for found in FORMATS:
+    if found.suffix in POINT_SUFFIXES:
+        continue  # points for surveyors, which nothing reads as a scene
     written = folder / f"again{found.suffix}"
     write_scene(written, scene)
     image = render(read_scene(written).gaussians, held_out, backend="cpu").image.numpy()
