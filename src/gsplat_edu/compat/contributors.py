@@ -41,7 +41,7 @@ class _Tile(NamedTuple):
 def _tiles(
     a: Tiles, transmittances: Tensor | None = None, batches: tuple[int, int | None] = (0, None)
 ) -> Iterator[_Tile]:
-    """Yield every tile; `batches` of tile_size² Gaussians of each list are looked at."""
+    """Yield every tile; `batches` is the range of a list that counts, in tile_size² Gaussians."""
     starts, rows, edge = a.isect_offsets.flatten().tolist(), a.flatten_ids, a.tile_size
     tiles_y, tiles_x = a.isect_offsets.shape[-2:]
     means2d, conics = a.means2d.detach().reshape(-1, 2).double(), a.conics.detach().reshape(-1, 3).double()
@@ -234,7 +234,7 @@ def rasterize_top_contributing_gaussian_ids(
 
 
 def _picked(a: Tiles, columns: int, strongest: int | None) -> tuple[Tensor, Tensor]:
-    """Return ids and weights of the first contributors, or of the strongest, in `columns`."""
+    """Return ids and weights of each pixel's first `columns` contributors, or of its strongest ones."""
     pixels = math.prod(_shape(a))
     ids = torch.full((pixels, columns), -1, dtype=torch.int32)
     weights = torch.zeros(pixels, columns, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The Gaussians that are drawn in a set of images, and their colours."""
+"""What all rasterisations share: limits, the Gaussians that are drawn, their colours, expected depths."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsplat_edu.base.constants import SH_OFFSET
+from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import Arguments
 from gsplat_edu.compat.harmonics import evaluate
+from gsplat_edu.compat.screen import Lens
+from gsplat_edu.render.api import BYTES_PER_PIXEL
+
+ALPHA_FLOOR = 1e-10
+"""gsplat's lower bound of alpha where it divides the depth by it, for ED."""
 
 
 class Drawn(NamedTuple):
@@ -55,3 +61,26 @@ def directions(a: Arguments, drawn: Drawn) -> Float[Tensor, "nnz 3"]:
     eyes = eyes.reshape(-1, 3)
     means = joined(a.means, a.means.ndim - 1).index_select(0, drawn.scenes * a.N + drawn.gaussians)
     return means - eyes.index_select(0, drawn.images)
+
+
+def lens_of(a: Arguments) -> Lens:
+    """Return the size of the images, and which Gaussians count."""
+    return Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
+
+
+def require_memory_for(a: Arguments) -> None:
+    """Check that there is room for the images.
+
+    Raises:
+        NotEnoughMemoryError: there is not.
+    """
+    require_memory(
+        f"{a.batches * a.C} images of {a.width}x{a.height} px",
+        BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
+        "render fewer images, or fewer pixels (width, height)",
+    )
+
+
+def with_expected_depth(image: Tensor, alphas: Tensor) -> Tensor:
+    """Return channels of which the last, a sum of weighted depths, is divided by alpha."""
+    return torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)

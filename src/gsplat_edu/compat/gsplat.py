@@ -34,7 +34,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsplat_edu.base.constants import SH_OFFSET
-from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.compat.checks import DEPTH_ONLY, Arguments, RollingShutterType, check_spreads
 from gsplat_edu.compat.contributors import (
     accumulate,
@@ -43,7 +42,16 @@ from gsplat_edu.compat.contributors import (
     rasterize_to_indices_in_range,
     rasterize_top_contributing_gaussian_ids,
 )
-from gsplat_edu.compat.drawn import Drawn, colors_of, directions, drawn_at, joined
+from gsplat_edu.compat.drawn import (
+    Drawn,
+    colors_of,
+    directions,
+    drawn_at,
+    joined,
+    lens_of,
+    require_memory_for,
+    with_expected_depth,
+)
 from gsplat_edu.compat.harmonics import (
     evaluate,
     spherical_harmonics,
@@ -60,13 +68,11 @@ from gsplat_edu.compat.projection import (
     solids_of,
     with_sparse_gradient,
 )
-from gsplat_edu.compat.screen import Lens
 from gsplat_edu.compat.skipping import skipping_bad_gaussians, without_bad_gaussians
 from gsplat_edu.compat.stages import stage
 from gsplat_edu.compat.surfel_images import rasterize_to_pixels_2dgs
 from gsplat_edu.compat.surfels import fully_fused_projection_2dgs, rasterization_2dgs
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
-from gsplat_edu.render.api import BYTES_PER_PIXEL
 
 __all__ = [
     "RollingShutterType",
@@ -92,9 +98,6 @@ __all__ = [
     "spherical_harmonics_l1_plus",
     "world_to_cam",
 ]
-
-ALPHA_FLOOR = 1e-10
-"""gsplat's lower bound of alpha where it divides the depth by it, for ED."""
 
 
 def rasterization(
@@ -160,11 +163,7 @@ def rasterization(
 
 
 def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    require_memory(
-        f"{a.batches * a.C} images of {a.width}x{a.height} px",
-        BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
-        "render fewer images, or fewer pixels (width, height)",
-    )
+    require_memory_for(a)
     touched: list[Tensor] = []
     if a.sparse_grad:
         shapes = {name: getattr(a, name) for name in ("means", "quats", "scales", "covars")}
@@ -217,17 +216,13 @@ class _OnScreen(NamedTuple):
     spreads: Float[Tensor, "nnz 3"]
 
 
-def _lens(a: Arguments) -> Lens:
-    return Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
-
-
 def _geometry(a: Arguments) -> list[Tensor]:
     """Return the positions of the drawn Gaussians in (B C N), their spreads, and the tensors of `META`."""
     triangle = None if a.covars is None else a.covars[..., TRIANGLE[0], TRIANGLE[1]]
     (viewmats, model), Ks = cameras_of(a), a.Ks.reshape(-1, a.C, 3, 3)
     flat, antialiased = a.opacities.reshape(a.batches, a.N), a.rasterize_mode == "antialiased"
     solids = solids_of(a.means, triangle, a.quats, a.scales)
-    found = project(solids, viewmats, Ks, _lens(a), flat, antialiased, model)
+    found = project(solids, viewmats, Ks, lens_of(a), flat, antialiased, model)
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
     spreads = joined(found.spreads, 3).index_select(0, positions)
     check_spreads("scales" if a.covars is None else "covars", spreads, positions, (a.batch, a.C, a.N))
@@ -256,7 +251,7 @@ def _images(a: Arguments, drawn: Drawn, on_screen: _OnScreen, kept: Absgrad | No
         signals = [image[..., first : first + E]]
         image = torch.cat([image[..., :first], image[..., first + E :]], dim=-1)
     if a.render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)
+        image = with_expected_depth(image, alphas)
     return [image, alphas, *signals]
 
 
@@ -289,7 +284,7 @@ def _draw(
         own: dict[str, Any] = {name: parts[name][k] if name in parts else None for name in tables}
         own_rows = own.pop("rows")
         splats = Splats(**own, background=None if backgrounds is None else backgrounds[k])
-        image, transmittance = composite(splats, _lens(a), None if kept is None else kept.adder(own_rows))
+        image, transmittance = composite(splats, lens_of(a), None if kept is None else kept.adder(own_rows))
         images.append(image)
         transmittances.append(transmittance)
     return images, transmittances

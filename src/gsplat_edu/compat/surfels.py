@@ -20,7 +20,6 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.base.headroom import require_memory
 from gsplat_edu.base.validation import flag, one_of
 from gsplat_edu.compat.checks import (
     DEPTH_ONLY,
@@ -32,14 +31,21 @@ from gsplat_edu.compat.checks import (
     check_scene,
     check_size,
 )
-from gsplat_edu.compat.drawn import Drawn, colors_of, drawn_at, joined
+from gsplat_edu.compat.drawn import (
+    Drawn,
+    colors_of,
+    drawn_at,
+    joined,
+    lens_of,
+    require_memory_for,
+    with_expected_depth,
+)
 from gsplat_edu.compat.images import Absgrad
 from gsplat_edu.compat.projection import EXTENT
 from gsplat_edu.compat.screen import Lens
 from gsplat_edu.compat.skipping import without_bad_gaussians
 from gsplat_edu.compat.surfel_images import SurfelImages, Surfels, TileLists, composite_surfels, shifted
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles
-from gsplat_edu.render.api import BYTES_PER_PIXEL
 from gsplat_edu.scene.gaussians import quat_to_R_t
 
 PLAIN = ONLY_VALUES | {
@@ -64,9 +70,6 @@ LEAST_VARIANCE = 1e-4
 
 MOST_RADIUS = float(2**31 - 128)
 """Largest radius, px: the largest int32 that float32 holds."""
-
-ALPHA_FLOOR = 1e-10
-"""gsplat's lower bound of alpha where it divides the depth by it, for ED."""
 
 
 class ProjectedSurfels(NamedTuple):
@@ -245,7 +248,7 @@ def _rasterize(
         image = image + torch.nn.functional.pad(behind, (0, image.shape[-1] - behind.shape[-1]))
     alphas, medians = 1.0 - T, found.median.view(*shape, 1)
     if a.render_mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alphas.clamp(min=ALPHA_FLOOR)], dim=-1)
+        image = with_expected_depth(image, alphas)
     poses = torch.linalg.inv(a.viewmats)
     surf_normals = None
     if a.render_mode.startswith("RGB+"):
@@ -258,11 +261,7 @@ def _rasterize(
 
 def _drawn_images(a: Arguments) -> tuple[SurfelImages, dict[str, Any]]:
     """Return the images of all cameras, without backgrounds, and `meta` without the distortion."""
-    require_memory(
-        f"{a.batches * a.C} images of {a.width}x{a.height} px",
-        BYTES_PER_PIXEL * a.batches * a.C * a.width * a.height,
-        "render fewer images, or fewer pixels (width, height)",
-    )
+    require_memory_for(a)
     meta, drawn, rows = _projected(a)
     kept = Absgrad(meta["means2d"]) if a.absgrad else None
     used = meta | {"ray_transforms": shifted(meta["ray_transforms"], meta["gradient_2dgs"])}
@@ -284,8 +283,7 @@ def _projected(a: Arguments) -> tuple[dict[str, Any], Drawn, Tensor]:
     """Return the tensors of `meta` that have a row for each splat, which splats are drawn, and their rows."""
     assert a.quats is not None
     assert a.scales is not None
-    lens = Lens(a.width, a.height, a.eps2d, a.near_plane, a.far_plane, a.radius_clip)
-    found = project_surfels(a.means, a.quats, a.scales, (a.viewmats, a.Ks), lens)
+    found = project_surfels(a.means, a.quats, a.scales, (a.viewmats, a.Ks), lens_of(a))
     positions = (found.radii > 0).all(dim=-1).flatten().nonzero()[:, 0]
     fields = found._asdict() | {"opacities": a.opacities.reshape(a.batches, 1, a.N).expand(-1, a.C, -1)}
     if a.packed:
