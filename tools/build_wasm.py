@@ -1,9 +1,9 @@
-"""Build the WebAssembly module src/gsplat_edu/tab/web/gsplat_edu.wasm with zig.
+"""Build the WebAssembly modules in src/gsplat_edu/tab/web with zig: for one thread, and for several.
 
     python tools/build_wasm.py [--check]
 
 It compiles native/ and wasm/ with the ziglang of the extra `dev`, a minute of processor time at first, and does nothing
-if the module was made from these sources. `--check` compiles nothing, and exits with 1 if the module is missing or old.
+if the modules were made from these sources. `--check` compiles nothing, and exits with 1 if one is missing or old.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-MODULE = ROOT / "src" / "gsplat_edu" / "tab" / "web" / "gsplat_edu.wasm"
+FOLDER = ROOT / "src" / "gsplat_edu" / "tab" / "web"
+MODULE, THREADED = FOLDER / "gsplat_edu.wasm", FOLDER / "gsplat_edu_threads.wasm"
 BUILD = ROOT / "build" / "wasm"
 
 KERNELS = (
@@ -38,16 +39,12 @@ KERNELS = (
 ONCE = ("native/frame", "native/loss", "native/scan", "native/sort")
 OWN = ("wasm/platform", "wasm/scene", "wasm/trainer", "wasm/module")
 
-TARGET = (
-    "-target",
-    "wasm32-wasi",
-    "-std=c++20",
-    "-msimd128",
-    "-mbulk-memory",
-    "-O3",
-    "-fno-exceptions",
-    "-fno-rtti",
-)
+TARGET = ("-target", "wasm32-wasi")
+FEATURES = "-mcpu=lime1+simd128+bulk_memory"
+"""What every browser of the last years has; zig builds its C library for the same features. Relaxed SIMD stays out: its
+bits differ between processors."""
+
+LANGUAGE = ("-std=c++20", "-O3", "-fno-exceptions", "-fno-rtti")
 WARNINGS = ("-Wall", "-Wextra", "-Wno-psabi", "-Werror")
 MATH = ("-fno-math-errno", "-fno-trapping-math")
 KERNEL_MATH = ("-fno-signed-zeros", "-ffp-contract=fast", "-DGSPLAT_ISA=wasm")
@@ -57,6 +54,15 @@ MOST_MEMORY = 65_535 << 16
 
 STACK = 1 << 20
 """Bytes of the stack: kernels keep tiles and strips on it."""
+
+THREADS = (f"{FEATURES}+atomics", "-DGSPLAT_THREADS")
+"""Flags of the module for several threads."""
+
+SHARED = (
+    "-Wl,--shared-memory",
+    *(f"-Wl,--export={name}" for name in ("__stack_pointer", "__wasm_init_tls", "__tls_size", "__tls_align")),
+)
+"""Flags of its linker: a worker gets a stack and thread-local variables of its own."""
 
 
 class NotBuiltError(Exception):
@@ -84,36 +90,42 @@ def stamp() -> str:
 
 
 def is_built() -> bool:
-    """Return whether the module was made from these sources."""
+    """Return whether the modules were made from these sources."""
     mark = BUILD / "stamp"
-    return MODULE.exists() and mark.exists() and mark.read_text() == stamp()
+    return MODULE.exists() and THREADED.exists() and mark.exists() and mark.read_text() == stamp()
 
 
 def build() -> None:
-    """Compile and link the module, which replaces the last one when it is complete.
+    """Compile and link the modules, which replace the last ones when they are complete.
 
     Raises:
         NotBuiltError: zig is missing, or it refuses a source.
     """
-    BUILD.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        jobs = [pool.submit(_compile, f"native/{name}", KERNEL_MATH) for name in KERNELS]
-        jobs += [pool.submit(_compile, name, ()) for name in (*ONCE, *OWN)]
-        objects = [job.result() for job in jobs]
-    made = BUILD / "gsplat_edu.wasm"
+        variants = [(MODULE, (FEATURES,), ()), (THREADED, THREADS, SHARED)]
+        jobs = [
+            [pool.submit(_compile, module.stem, f"native/{name}", (*KERNEL_MATH, *flags)) for name in KERNELS]
+            + [pool.submit(_compile, module.stem, name, flags) for name in (*ONCE, *OWN)]
+            for module, flags, _ in variants
+        ]
+        objects = [[job.result() for job in group] for group in jobs]
     linked = (f"-Wl,--max-memory={MOST_MEMORY}", f"-Wl,-z,stack-size={STACK}", "-Wl,--import-memory")
-    _zig("-target", "wasm32-wasi", "-mexec-model=reactor", "-s", *linked, *map(str, objects), "-o", str(made))
-    made.chmod(0o644)
-    MODULE.parent.mkdir(parents=True, exist_ok=True)
-    partial = MODULE.with_suffix(".partial")
-    partial.write_bytes(made.read_bytes())
-    partial.replace(MODULE)
+    for (module, flags, shared), files in zip(variants, objects, strict=True):
+        made = BUILD / module.name
+        words = (*TARGET, flags[0], "-mexec-model=reactor", "-s", *linked, *shared, *map(str, files))
+        _zig(*words, "-o", str(made))
+        FOLDER.mkdir(parents=True, exist_ok=True)
+        partial = module.with_suffix(".partial")
+        partial.write_bytes(made.read_bytes())
+        partial.replace(module)
     (BUILD / "stamp").write_text(stamp())
 
 
-def _compile(name: str, options: tuple[str, ...]) -> Path:
-    made = BUILD / f"{Path(name).name}.o"
-    _zig(*TARGET, *WARNINGS, *MATH, *options, "-c", f"{name}.cpp", "-o", str(made))
+def _compile(variant: str, name: str, options: tuple[str, ...]) -> Path:
+    folder = BUILD / variant
+    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / f"{Path(name).name}.o"
+    _zig(*TARGET, *LANGUAGE, *WARNINGS, *MATH, *options, "-c", f"{name}.cpp", "-o", str(made))
     return made
 
 
@@ -132,13 +144,13 @@ def _zig(*words: str) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Build the module, or check it; return the exit code."""
-    parser = argparse.ArgumentParser(description="Build the WebAssembly module with zig.")
+    parser = argparse.ArgumentParser(description="Build the WebAssembly modules with zig.")
     parser.add_argument(
         "--check", action="store_true", help="compile nothing; exit with 1 if the module is missing or old"
     )
     options = parser.parse_args(arguments)
     if is_built():
-        print(f"{MODULE.relative_to(ROOT)}: is up to date")
+        print(f"{FOLDER.relative_to(ROOT)}: the modules are up to date")
         return 0
     if options.check:
         print(
@@ -150,7 +162,8 @@ def main(arguments: list[str] | None = None) -> int:
     except NotBuiltError as error:
         print(f"build_wasm: {error}", file=sys.stderr)
         return 2
-    print(f"{MODULE.relative_to(ROOT)}: {MODULE.stat().st_size:,} bytes")
+    for module in (MODULE, THREADED):
+        print(f"{module.relative_to(ROOT)}: {module.stat().st_size:,} bytes")
     return 0
 
 

@@ -3,10 +3,12 @@
 
 import { readFileSync } from "node:fs";
 import { createInterface } from "node:readline";
+import { Worker } from "node:worker_threads";
 
 const web = process.argv[2];
 const engine = await import(`${web}/engine.js`);
-const compiled = await WebAssembly.compile(readFileSync(`${web}/gsplat_edu.wasm`));
+const file = (threads) => `${web}/gsplat_edu${threads > 1 ? "_threads" : ""}.wasm`;
+const compiled = (threads) => WebAssembly.compile(readFileSync(file(threads)));
 const KINDS = { Float64Array, Float32Array, Uint8Array };
 
 function unpacked(value) {
@@ -29,11 +31,27 @@ function packed(value) {
   return Object.fromEntries(Object.entries(value).map(([name, each]) => [name, packed(each)]));
 }
 
+// Node's worker in the clothes of a browser's.
+function startWorker(url) {
+  const start = `
+    const { parentPort } = require("node:worker_threads");
+    globalThis.self = { postMessage: (message) => parentPort.postMessage(message) };
+    import(${JSON.stringify(url.href)});
+    parentPort.on("message", (data) => import(${JSON.stringify(url.href)}).then(() => self.onmessage({ data })));`;
+  const worker = new Worker(start, { eval: true });
+  const like = { postMessage: (message) => worker.postMessage(message), terminate: () => worker.terminate() };
+  worker.on("message", (data) => like.onmessage({ data }));
+  worker.on("error", (error) => like.onerror(error));
+  worker.unref();
+  return like;
+}
+
 let module = null;
 let trainer = null;
 const calls = {
-  load: async ({ limit }) => {
-    module = await engine.loadModule(compiled, limit ? { limit } : {});
+  load: async ({ limit = engine.DEFAULT_LIMIT, threads = 1, file = threads }) => {
+    module?.close();
+    module = await engine.loadModule(await compiled(file), { limit, threads, startWorker });
     return { bytes: module.bytes };
   },
   render: ({ gaussians, camera, settings, upstream }) => engine.render(module, gaussians, camera, settings, upstream),
@@ -50,8 +68,8 @@ const calls = {
   gaussians: () => trainer.gaussians(),
   state: () => trainer.state(),
   resume: ({ state }) => trainer.load(state),
-  facts: () => ({
-    imports: WebAssembly.Module.imports(compiled).map(({ module, name }) => `${module}.${name}`),
+  facts: async ({ threads = 1 }) => ({
+    imports: WebAssembly.Module.imports(await compiled(threads)).map(({ module, name }) => `${module}.${name}`),
     bytes: module?.bytes ?? 0,
     seconds: (process.cpuUsage().user + process.cpuUsage().system) / 1e6,
   }),

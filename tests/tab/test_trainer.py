@@ -116,6 +116,21 @@ def test_a_training_has_the_same_bits_each_time_and_after_a_resume(node, egg):
     host.close()
 
 
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_give_the_same_bits(node, egg, threads):
+    """Also a thread more than there are cores, which joins late or not at all."""
+    views, held_out, points, colors = egg
+    states = []
+    for count in (1, threads):
+        host = Host(node)
+        host.ask("load", threads=count)
+        host.ask("train", **options_of(views, points, colors, iterations=60, maxGaussians=900))
+        host.ask("step", count=60)
+        states.append((host.ask("state").tobytes(), host.ask("score", view=view_of(held_out[0]))))
+        host.close()
+    assert states[0] == states[1]
+
+
 def test_a_state_of_another_training_is_refused(host, egg):
     views, _, points, colors = egg
     options = options_of(views, points, colors, iterations=20, maxGaussians=300)

@@ -16,6 +16,8 @@ import {
 
 const PAGE = 1 << 16; // bytes
 const FIRST_PAGES = 64;
+const MOST_PAGES = 65535;
+const WORKER_STACK = 1 << 20; // bytes
 export const DEFAULT_LIMIT = 2 ** 31; // bytes of memory
 
 export const PROJECTIONS = ["perspective", "fisheye", "equirectangular", "orthographic", "pinhole"];
@@ -57,26 +59,40 @@ export class EngineError extends Error {
 
 /**
  * Loads the module.
- * @param {BufferSource | WebAssembly.Module | URL | string} source Its bytes, or where they are.
- * @param {{ limit?: number }} options Bytes of memory that it may take, at most 4 GiB.
+ * @param {BufferSource | WebAssembly.Module | URL | string} source Its bytes, or where they are: gsplat_edu.wasm, or
+ *   gsplat_edu_threads.wasm for several threads.
+ * @param {{ limit?: number, threads?: number, startWorker?: (url: URL) => Worker }} options Bytes of memory that it may take, at most
+ *   4 GiB; threads, more than one only where memory may be shared (in a page: if it is cross-origin isolated); and how a worker is
+ *   started, for hosts without `Worker`.
  */
-export async function loadModule(source, { limit = DEFAULT_LIMIT } = {}) {
+export async function loadModule(source, { limit = DEFAULT_LIMIT, threads = 1, startWorker = browserWorker } = {}) {
   const compiled = await compile(source);
-  const most = Math.min(Math.floor(limit / PAGE), 65535);
-  const memory = new WebAssembly.Memory({ initial: FIRST_PAGES, maximum: Math.max(most, FIRST_PAGES) });
+  const shared = WebAssembly.Module.exports(compiled).some(({ name }) => name === "work");
+  if (threads > 1 && !shared) throw new EngineError("this module is for one thread; load gsplat_edu_threads.wasm");
+  if (shared && typeof SharedArrayBuffer === "undefined")
+    throw new EngineError("this page may not share memory between threads; load gsplat_edu.wasm");
+  const most = Math.max(Math.min(Math.floor(limit / PAGE), MOST_PAGES), FIRST_PAGES);
+  const memory = new WebAssembly.Memory({ initial: FIRST_PAGES, maximum: most, shared });
+  const { exports } = await WebAssembly.instantiate(compiled, importsOf(memory));
+  exports._initialize();
+  const module = new Module(exports, memory, threads);
+  if (threads > 1) await module.startWorkers(compiled, startWorker);
+  return module;
+}
+
+/** What an instance of the module needs from its host. */
+export function importsOf(memory) {
   const host = {
     refuse: (address, length) => {
-      throw new EngineError(new TextDecoder().decode(new Uint8Array(memory.buffer, address, length)));
+      throw new EngineError(new TextDecoder().decode(new Uint8Array(memory.buffer, address, length).slice()));
     },
     now: () => performance.now(),
   };
-  const { exports } = await WebAssembly.instantiate(compiled, {
-    env: { memory },
-    host,
-    wasi_snapshot_preview1: NO_FILES,
-  });
-  exports._initialize();
-  return new Module(exports, memory);
+  return { env: { memory }, host, wasi_snapshot_preview1: NO_FILES };
+}
+
+function browserWorker(url) {
+  return new Worker(url, { type: "module" });
 }
 
 async function compile(source) {
@@ -88,9 +104,38 @@ async function compile(source) {
 }
 
 class Module {
-  constructor(exports, memory) {
+  constructor(exports, memory, threads) {
     this.calls = exports;
     this.memory = memory;
+    this.threads = threads;
+    this.workers = [];
+  }
+
+  // Starts a worker for each thread but this one; all have this memory, and their own stacks and thread-local variables.
+  async startWorkers(compiled, startWorker) {
+    const { calls, memory } = this;
+    const url = new URL("./engine_worker.js", import.meta.url);
+    const ready = [];
+    for (let id = 1; id < this.threads; ++id) {
+      const stack = (calls.allocate(WORKER_STACK) >>> 0) + WORKER_STACK;
+      const locals = calls.allocate(calls.__tls_size.value + calls.__tls_align.value) >>> 0;
+      const worker = startWorker(url);
+      this.workers.push(worker);
+      ready.push(
+        new Promise((resolve, reject) => {
+          worker.onmessage = resolve;
+          worker.onerror = () => reject(new EngineError("a thread of the module could not be started"));
+        }),
+      );
+      worker.postMessage({ compiled, memory, id, stack, locals });
+    }
+    await Promise.all(ready);
+  }
+
+  /** Ends the workers; the module is not used afterwards. */
+  close() {
+    for (const worker of this.workers) worker.terminate();
+    this.workers = [];
   }
 
   // Bytes that the module has taken from the system.
@@ -246,7 +291,15 @@ export function render(module, gaussians, camera, settings = {}, upstream = null
     ).address;
     const cameraAddress = given(Float64Array, cameraNumbers(camera, settings.jacobianLimit ?? null)).address;
     const settingAddress = given(Float64Array, settingNumbers(settings)).address;
-    const drawn = calls[`draw_${suffix}`](count, rest, channels, addresses, cameraAddress, settingAddress, 1);
+    const drawn = calls[`draw_${suffix}`](
+      count,
+      rest,
+      channels,
+      addresses,
+      cameraAddress,
+      settingAddress,
+      module.threads,
+    );
     try {
       if (upstream) calls[`differentiate_${suffix}`](drawn, addresses);
     } finally {
@@ -340,7 +393,7 @@ export class Trainer {
         given(Float64Array, points).address,
         given(Float64Array, colors).address,
         points.length / 3,
-        1,
+        module.threads,
       ),
     );
     for (const view of views) this.addView(view);
