@@ -301,48 +301,77 @@ GSPLAT_INLINE void for_each_chunk(const HarmonicArgs<T> &args, int64_t block, F 
     if (count) f(indices, count);
 }
 
+template <int DEGREE, class T>
+GSPLAT_INLINE void chunk_colors(const HarmonicArgs<T> &args, const int64_t *indices, int count) {
+    using V = typename Channels<T>::V;
+    constexpr int LAST = (DEGREE + 1) * (DEGREE + 1) - 1;
+    const Directions<T> at(args, indices, count);
+    for (int l = 0; l < count; ++l) {
+        const T *sh = args.coefficients + 3 * args.stored * args.row_of[indices[l]];
+        V color = V{};
+#pragma GCC unroll 16
+        for (int j = 0; j < LAST; ++j) color += load<V>(sh + 3 * j) * at.basis[j][l];
+        color += channels(sh + 3 * LAST) * at.basis[LAST][l];  // a load of four could leave the array
+        for (int k = 0; k < 3; ++k) args.colors[3 * indices[l] + k] = color[k];
+    }
+}
+
 template <class T>
 void harmonic_colors(const HarmonicArgs<T> &args, int64_t block) {
-    for_each_chunk(args, block, [&](const int64_t *indices, int count) {
-        const Directions<T> at(args, indices, count);
-        for (int l = 0; l < count; ++l) {
-            const T *sh = args.coefficients + 3 * args.stored * args.row_of[indices[l]];
-            T color[3] = {};
-            for (int j = 0; j < args.used(); ++j)
-                for (int k = 0; k < 3; ++k) color[k] += at.basis[j][l] * sh[3 * j + k];
-            for (int k = 0; k < 3; ++k) args.colors[3 * indices[l] + k] = color[k];
-        }
+    with_degree(args.degree, [&]<int DEGREE>() {
+        for_each_chunk(args, block, [&](const int64_t *indices, int count) { chunk_colors<DEGREE>(args, indices, count); });
     });
+}
+
+// Adds the products basis[j] color[k] in lane l to a row of coefficients, or replaces the row by them.
+template <int DEGREE, class T>
+GSPLAT_INLINE void to_coefficients(const HarmonicArgs<T> &args, const Directions<T> &at, int l, const T *color, T *row) {
+    using V = typename Channels<T>::V;
+    constexpr int LAST = (DEGREE + 1) * (DEGREE + 1) - 1;
+    const V all = channels(color);
+#pragma GCC unroll 16
+    for (int j = 0; j < LAST; ++j) {  // the fourth number is the next one's first
+        const V product = all * at.basis[j][l];
+        store(row + 3 * j, args.overwrites ? product : load<V>(row + 3 * j) + product);
+    }
+    for (int k = 0; k < 3; ++k) row[3 * LAST + k] = at.basis[LAST][l] * color[k] + (args.overwrites ? T(0) : row[3 * LAST + k]);
+    if (args.overwrites) memset(row + 3 * (LAST + 1), 0, 3 * size_t(args.stored - LAST - 1) * sizeof(T));
+}
+
+// Propagates the colours' gradients of a chunk to the coefficients and directions.
+template <int DEGREE, class T>
+GSPLAT_INLINE void chunk_backward(const HarmonicArgs<T> &args, const int64_t *indices, int count) {
+    using V = typename Vector<T>::V;
+    constexpr int USED = (DEGREE + 1) * (DEGREE + 1);
+    const Directions<T> at(args, indices, count);
+    alignas(64) T along_basis[16][CHUNK] = {}, to_direction[3][CHUNK];
+    for (int l = 0; l < count; ++l) {
+        const int64_t offset = 3 * args.stored * args.row_of[indices[l]];
+        const T *sh = args.coefficients + offset, *of = args.grad_colors + 3 * indices[l];
+#pragma GCC unroll 16
+        for (int j = 0; j < USED; ++j) along_basis[j][l] = dot3(sh + 3 * j, of);
+        to_coefficients<DEGREE>(args, at, l, of, args.grad_coefficients + offset);
+    }
+    for (int l = 0; l < count; l += Vector<T>::LANES) {
+        V b[16], d[3], dir[3];
+        for (int j = 0; j < USED; ++j) b[j] = load<V>(along_basis[j] + l);
+        for (int k = 0; k < 3; ++k) dir[k] = load<V>(at.dir[k] + l);
+        harmonics_backward<T>(DEGREE, dir[0], dir[1], dir[2], b, d);
+        const V along = dot3(d, dir), inverse = load<V>(at.inverse + l);
+        for (int k = 0; k < 3; ++k) store(to_direction[k] + l, (d[k] - along * dir[k]) * inverse);
+    }
+    for (int l = 0; l < count; ++l)
+        for (int k = 0; k < 3; ++k) args.grad_directions[3 * indices[l] + k] = to_direction[k][l];
 }
 
 template <class T>
 void harmonic_colors_backward(const HarmonicArgs<T> &args, int64_t block) {
-    using V = typename Vector<T>::V;
     const int64_t width = 3 * args.stored, end = vmin(args.rows, (block + 1) * BLOCK);
     if (args.overwrites)
-        for (int64_t row = block * BLOCK; row < end; ++row) memset(args.grad_coefficients + width * row, 0, size_t(width) * sizeof(T));
-    for_each_chunk(args, block, [&](const int64_t *indices, int count) {
-        const Directions<T> at(args, indices, count);
-        alignas(64) T along_basis[16][CHUNK] = {}, to_direction[3][CHUNK];
-        for (int l = 0; l < count; ++l) {
-            const int64_t offset = width * args.row_of[indices[l]];
-            const T *sh = args.coefficients + offset, *of = args.grad_colors + 3 * indices[l];
-            T *to = args.grad_coefficients + offset;
-            for (int j = 0; j < args.used(); ++j) {
-                along_basis[j][l] = dot3(sh + 3 * j, of);
-                for (int k = 0; k < 3; ++k) to[3 * j + k] += at.basis[j][l] * of[k];
-            }
-        }
-        for (int l = 0; l < count; l += Vector<T>::LANES) {
-            V b[16], d[3], dir[3];
-            for (int j = 0; j < args.used(); ++j) b[j] = load<V>(along_basis[j] + l);
-            for (int k = 0; k < 3; ++k) dir[k] = load<V>(at.dir[k] + l);
-            harmonics_backward<T>(args.degree, dir[0], dir[1], dir[2], b, d);
-            const V along = dot3(d, dir), inverse = load<V>(at.inverse + l);
-            for (int k = 0; k < 3; ++k) store(to_direction[k] + l, (d[k] - along * dir[k]) * inverse);
-        }
-        for (int l = 0; l < count; ++l)
-            for (int k = 0; k < 3; ++k) args.grad_directions[3 * indices[l] + k] = to_direction[k][l];
+        for (int64_t row = block * BLOCK; row < end; ++row)
+            if (args.index_of[row] < 0) memset(args.grad_coefficients + width * row, 0, size_t(width) * sizeof(T));
+    with_degree(args.degree, [&]<int DEGREE>() {
+        for_each_chunk(args, block, [&](const int64_t *indices, int count) { chunk_backward<DEGREE>(args, indices, count); });
     });
 }
 

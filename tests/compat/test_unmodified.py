@@ -2,6 +2,7 @@
 
 import sys
 import threading
+import time
 from types import ModuleType
 
 import pytest
@@ -199,6 +200,42 @@ def test_questions_about_the_gpu_have_answers(installed):
     torch.cuda.reset_peak_memory_stats()
     with torch.cuda.device(torch.cuda.current_device()):
         assert torch.ones(2).to(torch.cuda.current_device()).device.type == "cpu"
+
+
+def test_events_measure_the_time_between_them(installed):
+    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(True, blocking=True)
+    began = time.perf_counter()
+    begin.record()
+    torch.ones(100, device="cuda").sum()
+    end.record(torch.cuda.current_stream())
+    limit = 1000 * (time.perf_counter() - began)
+    end.synchronize()
+    end.wait()
+    assert end.query() and 0 < begin.elapsed_time(end) <= limit
+    assert end.elapsed_time(begin) == -begin.elapsed_time(end)
+
+
+def test_events_without_a_time_are_refused(installed):
+    timed = torch.cuda.Event(enable_timing=True)
+    with pytest.raises(ArgumentError, match=r"^elapsed_time: the start has no time; call record\(\) first$"):
+        timed.elapsed_time(timed)
+    timed.record()
+    untimed = torch.cuda.current_stream().record_event()
+    with pytest.raises(ArgumentError, match="the end has no time; make it with enable_timing=True"):
+        timed.elapsed_time(untimed)
+
+
+def test_streams_run_in_the_order_of_the_program(installed):
+    copies, x = torch.cuda.Stream(priority=-1), torch.zeros(3, device="cuda")
+    copies.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(copies):
+        x += 1
+        done = copies.record_event(torch.cuda.Event())
+    torch.cuda.default_stream().wait_event(done)
+    torch.cuda.set_stream(copies)
+    x.record_stream(copies)
+    copies.synchronize()
+    assert copies.query() and done.query() and x.tolist() == [1, 1, 1]
 
 
 class Subclassed(threading.Thread):

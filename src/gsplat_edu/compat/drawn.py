@@ -32,6 +32,9 @@ class Drawn(NamedTuple):
 
 def drawn_at(positions: Int64[Tensor, " nnz"], a: Arguments) -> Drawn:
     """Return what is at positions in the arrays (B C N)."""
+    if a.batches * a.C == 1:
+        first = torch.zeros_like(positions)
+        return Drawn(positions, first, first, positions, [len(positions)])
     images = positions // max(a.N, 1)
     ends = torch.bincount(images, minlength=a.batches * a.C).cumsum(0).tolist()
     return Drawn(positions, images // a.C, images, positions % max(a.N, 1), ends)

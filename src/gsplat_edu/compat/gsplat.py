@@ -12,10 +12,11 @@ one and lists the differences.
 Design. gsplat has three stages, each differentiable: projection and harmonics, then compositing of what they return.
 Its strategies call `meta["means2d"].retain_grad()` before the backward pass and read `.grad` and `.absgrad` after it.
 So the stages here are the same. Projection and harmonics are native steps of the graph (screen.py), or torch operations
-for lenses, degree 4 and other than three channels; `meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are
-nodes of the graph between them and the image. Compositing is our native kernels (images.py), whose gradient with
-respect to a mean on the screen arrives at `meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad,
-hooks and losses on these tensors work without special cases. `absgrad` is a statistic that the kernels collect; hooks
+for lenses, degree 4 and other than three channels; usual.py joins them to one step for the usual call.
+`meta["means2d"]`, `meta["depths"]` and `meta["opacities"]` are nodes of the graph between them and the image.
+Compositing is our native kernels (images.py), whose gradient with respect to a mean on the screen arrives at
+`meta["means2d"]` by autograd, per axis and per px. Therefore retain_grad, hooks and losses on these tensors work
+without special cases. `absgrad` is a statistic that the kernels collect; hooks
 on their inputs add it up, and a hook on the centres assigns the sums to the attribute at the end of each backward pass.
 
 The renderer's own projection is not used: it returns no centres that a graph could pass through. Compositing projects
@@ -73,6 +74,7 @@ from gsplat_edu.compat.stages import stage
 from gsplat_edu.compat.surfel_images import rasterize_to_pixels_2dgs
 from gsplat_edu.compat.surfels import fully_fused_projection_2dgs, rasterization_2dgs
 from gsplat_edu.compat.tiles import isect_offset_encode, isect_tiles, rasterize_to_pixels
+from gsplat_edu.compat.usual import image_of, is_usual, project_usual
 
 __all__ = [
     "RollingShutterType",
@@ -176,7 +178,11 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     def geometry(*values: Tensor) -> list[Tensor]:
         return _geometry(a.with_tensors(dict(zip(tensors, values, strict=True))))
 
-    positions, spreads, *found = stage(geometry, *tensors.values())
+    usual = is_usual(a)
+    if usual:
+        positions, spreads, colors, *found = project_usual(a)
+    else:
+        positions, spreads, *found = stage(geometry, *tensors.values())
     drawn = drawn_at(positions, a)
     if a.sparse_grad:
         touched.append(drawn.gaussians.bincount().nonzero()[:, 0])
@@ -189,6 +195,8 @@ def _rasterize(a: Arguments) -> tuple[Tensor, Tensor, dict[str, Any]]:
     for name, size in (("tile_width", a.width), ("tile_height", a.height)):
         meta[name] = math.ceil(size / a.edge)
     kept = Absgrad(meta["means2d"]) if a.absgrad else None
+    if usual:
+        return *image_of(a, positions, spreads, colors, meta, kept), meta
     on_screen = (meta["means2d"] if kept is None else kept.means2d, meta["depths"], meta["opacities"])
 
     def images(

@@ -12,6 +12,7 @@ gsplat's pixels are sampled at their centres, (0.5, 0.5) for the first, ours at 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -96,16 +97,16 @@ def _render(
     """Composite up to three colours and the features over zero."""
     if front.numel() and float(front.detach().abs().amax()) > COLOR_LIMIT:
         raise ArgumentError(f"colors: exceed {COLOR_LIMIT:g}, beyond which the kernels skip a Gaussian")
+    missing = COLOR_CHANNELS - front.shape[1]
     means, cov3ds = _Raised.apply(splats.means2d, splats.spreads)  # type: ignore[no-untyped-call]
     view = render_on_screen(
         (
             means,
             cov3ds,
-            torch.nn.functional.pad(front, (0, COLOR_CHANNELS - front.shape[1])),
+            front if missing == 0 else torch.nn.functional.pad(front, (0, missing)),
             splats.opacities,
         ),
-        Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, lens.height, lens.width),
-        dataclasses.replace(SETTINGS, dilation=lens.eps2d),
+        *_flat(lens.width, lens.height, lens.eps2d),
         features,
         splats.order,
     )
@@ -115,6 +116,13 @@ def _render(
         # the image: that would be a circle of references through the graph.
         means.register_hook(lambda _: absgrad(visible, found()["absgrad"]))
     return view
+
+
+@functools.lru_cache(maxsize=16)
+def _flat(width: int, height: int, eps2d: float) -> tuple[Camera, RenderSettings]:
+    """Return the camera and settings that leave Gaussians on the screen as they are."""
+    camera = Camera(np.eye(3), np.zeros(3), 1.0, 1.0, 0.0, 0.0, height, width)
+    return camera, dataclasses.replace(SETTINGS, dilation=eps2d)
 
 
 @first_derivative_only("gsplat's rasterization", INSTEAD)
@@ -130,8 +138,10 @@ class _Raised(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, means: Tensor, cov3ds: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-        spreads = cov3ds.reshape(-1, 9)[:, (0, 1, 4)]
-        spreads[:, 1] += cov3ds[:, 1, 0]
+        rows = cov3ds.reshape(-1, 9)
+        spreads = rows.new_empty(len(rows), 3)
+        spreads[:, 0], spreads[:, 2] = rows[:, 0], rows[:, 4]
+        torch.add(rows[:, 1], rows[:, 3], out=spreads[:, 1])
         return means[:, :2].contiguous(), spreads
 
 

@@ -86,44 +86,71 @@ class _Screen(torch.autograd.Function):
         viewmats: Tensor,
         Ks: Tensor,
     ) -> tuple[Tensor, ...]:
-        kept = [None if t is None else t.detach().contiguous() for t in (means, covars, quats, scales)]
-        (B, C), N = viewmats.shape[:2], means.shape[1]
-        shapes = ((B, C, N, 2), (B, C, N), (B, C, N, 3), (B, C, N), (B, C, N, 3))
-        out = [torch.empty(shape, dtype=torch.float64) for shape in shapes]
-        drawable = torch.empty((B, C, N), dtype=torch.uint8)
-        names = ("centres", "depths", "conics", "compensations", "spreads", "drawable")
-        for b, c, given in _cameras(limits, kept, viewmats, Ks):
-            own = {name: native_array(each[b, c]) for name, each in zip(names, (*out, drawable), strict=True)}
-            kernel("screen_f", means.dtype)(**given, **own)
+        given = Solids(
+            *(None if t is None else t.detach().contiguous() for t in (means, covars, quats, scales))  # type: ignore[arg-type]
+        )
+        found = screen(given, viewmats, Ks, *limits)
         ctx.limits = limits
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*kept, viewmats, Ks)
-        found = drawable.view(torch.bool)
-        ctx.mark_non_differentiable(found)
-        return (*out, found)
+        ctx.save_for_backward(*given, viewmats, Ks)
+        ctx.mark_non_differentiable(found.drawable)
+        return tuple(found)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         *kept, viewmats, Ks = ctx.saved_tensors
-        arriving = [None if g is None else g.contiguous() for g in grads[:5]]
-        gradients = [None if t is None else torch.zeros_like(t) for t in kept]
-        to_viewmats, to_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
-        names = ("grad_centres", "grad_depths", "grad_conics", "grad_compensations", "grad_spreads")
-        into = ("grad_means", "grad_covars", "grad_quats", "grad_scales")
-        for b, c, given in _cameras(ctx.limits, kept, viewmats, Ks):
-            own = {
-                name: None if g is None else native_array(g[b, c])
-                for name, g in zip(names, arriving, strict=True)
-            }
-            own |= {
-                name: native_array(g[b]) for name, g in zip(into, gradients, strict=True) if g is not None
-            }
-            found = kernel("screen_backward_f", kept[0].dtype)(**given, **own)
-            sums = torch.tensor(found, dtype=torch.float64)
-            to_viewmats[b, c, :3] = sums[:12].view(3, 4)
-            for k in (0, 1):
-                to_Ks[b, c, k, k], to_Ks[b, c, k, 2] = sums[12 + k], sums[14 + k]
-        return None, *gradients, to_viewmats, to_Ks
+        lens, margin = ctx.limits
+        return None, *screen_gradients(Solids(*kept), viewmats, Ks, lens, margin, grads[:5])
+
+
+def screen(solids: Solids, viewmats: Tensor, Ks: Tensor, lens: Lens, margin: float) -> OnScreen:
+    """Project as `through_pinhole` does, outside of any graph; all tensors are contiguous."""
+    (B, C), N = viewmats.shape[:2], solids.means.shape[1]
+    shapes = ((B, C, N, 2), (B, C, N), (B, C, N, 3), (B, C, N), (B, C, N, 3))
+    out = [torch.empty(shape, dtype=torch.float64) for shape in shapes]
+    drawable = torch.empty((B, C, N), dtype=torch.uint8)
+    names = ("centres", "depths", "conics", "compensations", "spreads", "drawable")
+    for b, c, given in _cameras((lens, margin), solids, viewmats, Ks):
+        own = {name: native_array(each[b, c]) for name, each in zip(names, (*out, drawable), strict=True)}
+        kernel("screen_f", solids.means.dtype)(**given, **own)
+    return OnScreen(*(*out, drawable.view(torch.bool)))
+
+
+def screen_gradients(
+    solids: Solids,
+    viewmats: Tensor,
+    Ks: Tensor,
+    lens: Lens,
+    margin: float,
+    grads: Sequence[Tensor | None],
+) -> list[Tensor | None]:
+    """Return the gradients of `screen`: of the solids, of which some are None, of viewmats and of Ks.
+
+    Args:
+        solids: Those given to `screen`.
+        viewmats: Its cameras' matrices.
+        Ks: Its cameras' intrinsics.
+        lens: Its lens.
+        margin: Its margin.
+        grads: Gradients of the first five fields of its result, float64; None for zero.
+    """
+    arriving = [None if g is None else g.contiguous() for g in grads]
+    gradients = [None if t is None else torch.zeros_like(t) for t in solids]
+    to_viewmats, to_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
+    names = ("grad_centres", "grad_depths", "grad_conics", "grad_compensations", "grad_spreads")
+    into = ("grad_means", "grad_covars", "grad_quats", "grad_scales")
+    for b, c, given in _cameras((lens, margin), solids, viewmats, Ks):
+        own = {
+            name: None if g is None else native_array(g[b, c])
+            for name, g in zip(names, arriving, strict=True)
+        }
+        own |= {name: native_array(g[b]) for name, g in zip(into, gradients, strict=True) if g is not None}
+        found = kernel("screen_backward_f", solids.means.dtype)(**given, **own)
+        sums = torch.tensor(found, dtype=torch.float64)
+        to_viewmats[b, c, :3] = sums[:12].view(3, 4)
+        for k in (0, 1):
+            to_Ks[b, c, k, k], to_Ks[b, c, k, 2] = sums[12 + k], sums[14 + k]
+    return [*gradients, to_viewmats, to_Ks]
 
 
 def _cameras(limits: tuple[Lens, float], kept: Sequence[Tensor | None], viewmats: Tensor, Ks: Tensor) -> Any:  # noqa: ANN401
@@ -203,27 +230,47 @@ class _Harmonics(torch.autograd.Function):
         ends: Sequence[int],
     ) -> Tensor:
         directions, coefficients = directions.detach().contiguous(), coefficients.detach().contiguous()
-        colors = torch.empty_like(directions)
         ctx.degree, ctx.ends = degree, ends
         ctx.save_for_backward(directions, coefficients, rows)
-        for part, given in _images(degree, directions, coefficients, rows, ends):
-            kernel("harmonics_f", colors.dtype)(**given, colors=native_array(colors[part]))
-        return colors
+        return harmonics(degree, directions, coefficients, rows, ends)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         directions, coefficients, rows = ctx.saved_tensors
-        grad = grad.contiguous()
-        to_directions, to_coefficients = torch.empty_like(directions), torch.empty_like(coefficients)
-        for part, given in _images(ctx.degree, directions, coefficients, rows, ctx.ends):
-            kernel("harmonics_backward_f", grad.dtype)(
-                **given,
-                grad_colors=native_array(grad[part]),
-                grad_directions=native_array(to_directions[part]),
-                grad_coefficients=native_array(to_coefficients),
-                overwrites=not part.start,
-            )
-        return None, to_directions if ctx.degree else None, to_coefficients, None, None
+        found = harmonic_gradients(ctx.degree, directions, coefficients, rows, ctx.ends, grad)
+        return None, found[0] if ctx.degree else None, found[1], None, None
+
+
+def harmonics(
+    degree: int, directions: Tensor, coefficients: Tensor, rows: Tensor, ends: Sequence[int]
+) -> Tensor:
+    """Evaluate harmonics as `harmonic_colors` does, outside of any graph; all tensors are contiguous."""
+    colors = torch.empty_like(directions)
+    for part, given in _images(degree, directions, coefficients, rows, ends):
+        kernel("harmonics_f", colors.dtype)(**given, colors=native_array(colors[part]))
+    return colors
+
+
+def harmonic_gradients(
+    degree: int,
+    directions: Tensor,
+    coefficients: Tensor,
+    rows: Tensor,
+    ends: Sequence[int],
+    grad: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients of `harmonics` with respect to directions and coefficients; `grad` is that of the result."""
+    grad = grad.contiguous()
+    to_directions, to_coefficients = torch.empty_like(directions), torch.empty_like(coefficients)
+    for part, given in _images(degree, directions, coefficients, rows, ends):
+        kernel("harmonics_backward_f", grad.dtype)(
+            **given,
+            grad_colors=native_array(grad[part]),
+            grad_directions=native_array(to_directions[part]),
+            grad_coefficients=native_array(to_coefficients),
+            overwrites=not part.start,
+        )
+    return to_directions, to_coefficients
 
 
 def _images(degree: int, directions: Tensor, coefficients: Tensor, rows: Tensor, ends: Sequence[int]) -> Any:  # noqa: ANN401

@@ -34,6 +34,7 @@ from torch.overrides import TorchFunctionMode
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.base.printing import complain
 from gsplat_edu.compat import gsplat as ours
+from gsplat_edu.compat.streams import CURRENT, Event, Stream
 
 CUDA = re.compile(r"cuda(:\d+)?")
 """Names of CUDA devices."""
@@ -133,6 +134,11 @@ def _returning(result: object) -> Callable[[object], Callable[..., Any]]:
     return lambda function: lambda *args, **kwargs: result
 
 
+def _becoming(replacement: object) -> Callable[[object], object]:
+    """Return what replaces anything by `replacement`."""
+    return lambda original: replacement
+
+
 def _with_mode(start: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
     """Wrap `Thread.start`: the new thread has the mode as well."""
 
@@ -171,12 +177,19 @@ PATCHES: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
     (torch.cuda, "set_device", _returning(None)),
     (torch.cuda, "current_device", _returning(0)),
     (torch.cuda, "device", _returning(nullcontext())),
+    (torch.cuda, "Event", _becoming(Event)),
+    (torch.cuda, "Stream", _becoming(Stream)),
+    (torch.cuda, "current_stream", _returning(CURRENT)),
+    (torch.cuda, "default_stream", _returning(CURRENT)),
+    (torch.cuda, "set_stream", _returning(None)),
+    (torch.cuda, "stream", _returning(nullcontext())),
+    (torch.Tensor, "record_stream", _returning(None)),
     (torch.cuda, "max_memory_allocated", _returning(0)),
     (torch.cuda, "memory_allocated", _returning(0)),
     (torch.cuda, "reset_peak_memory_stats", _returning(None)),
     (threading.Thread, "start", _with_mode),
 )
-"""Functions of torch that `install` replaces: owner, name, and what makes the replacement."""
+"""Functions and classes of torch that `install` replaces: owner, name, and what makes the replacement."""
 
 
 def _set(stack: ExitStack, owner: Any, name: str, value: object) -> None:  # noqa: ANN401
