@@ -112,9 +112,9 @@ def format_of(path: str | Path) -> Format:
 
 def stored_bytes(path: Path) -> int:
     """Return the size of a scene on disk in bytes; for a folder, that of all files with splats."""
-    if format_of(path) in READ_FORMATS:
-        module = importlib.import_module(format_of(path).module)
-        return sum(file.stat().st_size for file in module.files_of(path))
+    for found in READ_FORMATS:
+        if path.name.lower().endswith(found.suffix):
+            return sum(file.stat().st_size for file in importlib.import_module(found.module).files_of(path))
     if path.name.lower() == LOD_META:
         from gsplat_edu.io.lod.codec import stored_bytes as of_all_levels
 
