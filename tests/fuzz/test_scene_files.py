@@ -10,6 +10,7 @@ import tiers
 from damage import damaged_bytes
 from gsplat_edu.base.errors import SceneFormatError
 from gsplat_edu.io.formats import read_scene
+from lcc_files import small_lcc, small_lcc2
 from scene_files import IN_A_PROCESS, small_file, small_levels, suffixes
 
 pytestmark = pytest.mark.fuzz
@@ -68,9 +69,10 @@ def test_damage_inside_a_sog(tmp_path):
         check(path, seed)
 
 
-def test_damage_inside_levels_of_detail(tmp_path):
+@pytest.mark.parametrize("small", [small_levels, small_lcc, small_lcc2])
+def test_damage_inside_levels_of_detail(tmp_path, small):
     """Half of the damage is in the index, the rest in one of the files that it names."""
-    whole = small_levels(tmp_path)
+    whole = small(tmp_path)
     files = sorted(file for file in whole.parent.rglob("*") if file.is_file())
     for seed in SEEDS:
         rng = np.random.default_rng(seed)

@@ -9,19 +9,22 @@ import pytest
 import torch
 
 from gsplat_edu.io.axes import half_turned
+from gsplat_edu.io.edit import Similarity
 from gsplat_edu.io.formats import read_scene, write_scene
 from gsplat_edu.scene.gaussian_math import build_cov3d_batch, quat_to_R_batch
+from gsplat_edu.scene.gaussians import Gaussians
+from lcc_files import lcc_scene, write_lcc, write_lcc2
 from scene_files import matched, random_scene
 
 NPM = Path(__file__).parents[1] / "npm" / "node_modules" / "@playcanvas" / "splat-transform"
 
 
-def converted(source, target):
+def converted(source, target, *options):
     """Convert with the program; skip the test without it."""
     node = shutil.which("node")
     if node is None or not NPM.is_dir():
         pytest.skip("splat-transform is not installed: npm ci --prefix tests/npm")
-    words = [node, NPM / "bin" / "cli.mjs", "-q", "-w", "-g", "cpu", source, target]
+    words = [node, NPM / "bin" / "cli.mjs", "-q", "-w", "-g", "cpu", *options, source, target]
     subprocess.run(list(map(str, words)), capture_output=True, timeout=300, check=True)
     return read_scene(target).gaussians
 
@@ -101,3 +104,23 @@ def test_we_read_what_only_it_writes(tmp_path, name):
         for one in (given, back)
     ]
     np.testing.assert_allclose(shapes[1], shapes[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["lcc", ".sog", ".spz"])
+def test_it_reads_lcc_as_we_do(tmp_path, kind):
+    """It takes the finest level without the environment, and turns it from z up to the axes of a PLY, y down."""
+    finest = [lcc_scene(60, 1), lcc_scene(40, 2)]
+    if kind == "lcc":
+        path = write_lcc(tmp_path / "meta.lcc", finest, lcc_scene(10, 3), None)
+    else:
+        path = tmp_path / "meta.lcc2"
+        write_lcc2(path, Gaussians.concatenated(finest), lcc_scene(10, 3), lcc_scene(5, 4), kind)
+    its = converted(path, tmp_path / "its.ply", "--select-lod", "0")
+    ours = Similarity(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), 1.0, np.zeros(3)).gaussians(
+        read_scene(path).gaussians[:100]
+    )
+    assert len(its) == 100
+    for name in ("means", "log_scales", "sh0", "sh_rest", "logit_opacities"):
+        torch.testing.assert_close(its.tensors()[name], ours.tensors()[name], rtol=1e-5, atol=1e-5)
+    a, b = (torch.nn.functional.normalize(one.quats, dim=1) for one in (ours, its))
+    assert (1.0 - (a * b).sum(dim=1).abs() <= 1e-6).all()

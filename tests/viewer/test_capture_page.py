@@ -21,6 +21,7 @@ from gsplat_edu.viewer.capture_serve import CaptureServer, Examination
 from viewer.captures import measured, ring
 from viewer.handles import until
 from viewer.pages import running
+from waiting import FRAMES, awaited, resize
 
 REFUSED = "the server responded with a status of 400"
 """What Chromium logs about an answer that the page shows to the user."""
@@ -443,3 +444,16 @@ def test_axe_finds_nothing_serious(opened):
     for summary in tab.locator("summary:visible").all():
         summary.click()
     assert grave_faults_in_all_styles(tab) == []
+
+
+def test_a_page_that_is_hidden_draws_again_when_it_is_shown(opened):
+    """As in a frame of a page that hides it: the canvas has no size, and its picture would be a single pixel."""
+    tab = opened()
+    tab.evaluate("document.documentElement.style.display = 'none'")
+    resize(tab, 700, 500)
+    tab.evaluate("viewer.askFrame()")
+    tab.evaluate(FRAMES)
+    assert tab.evaluate("viewer.canvas.width") == 900
+    tab.evaluate("document.documentElement.style.display = ''")
+    awaited(tab, lambda: tab.evaluate("[viewer.canvas.width, viewer.canvas.height]") == [700, 500])
+    awaited(tab, lambda: pixels(tab).std() > 5)

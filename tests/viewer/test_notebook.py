@@ -179,3 +179,20 @@ def test_the_page_draws_in_a_notebooks_frame(browser, ball):
     frame.wait_for_selector("#message", state="hidden")
     until_in(tab, frame, RESTS)
     assert frame.evaluate("viewer.facts.count") == len(ball)
+
+
+@pytest.mark.parametrize("hidden", ["display: none", "width: 0", "height: 0; overflow: hidden"])
+def test_a_page_whose_frame_is_hidden_at_first_draws_when_it_is_shown(browser, ball, hidden):
+    """No input, and no picture before: that of a canvas without a size would be a single pixel."""
+    tab = browser.new_page()
+    tab.set_content(f'<div style="{hidden}">{ball.view()._repr_html_()}</div>')
+    (frame,) = (each for each in tab.frames if each.parent_frame)
+    until_in(tab, frame, "document.readyState === 'complete'")
+    pixels_before = frame.evaluate("document.getElementById('canvas').width")
+    tab.evaluate("document.querySelector('div').style = ''")
+    until_in(tab, frame, RESTS)
+    until_in(tab, frame, "viewer.canvas.width === innerWidth && viewer.canvas.height === innerHeight")
+    frame.wait_for_selector("#message", state="hidden")
+    shown = pixels(tab.locator("iframe").screenshot())
+    middle = shown[shown.shape[0] // 4 : -shown.shape[0] // 4, shown.shape[1] // 4 : -shown.shape[1] // 4]
+    assert middle.std() > 5 and pixels_before != 1

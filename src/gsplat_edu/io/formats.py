@@ -24,7 +24,8 @@ class Format:
 
     Args:
         suffix: Suffix of its files, in lower case; for a folder, the whole name of the file that represents it.
-        module: Module with `read(path) -> Scene` and `write(path, scene)`; it is imported when it is needed.
+        module: Module with `read(path) -> Scene` and `write(path, scene)`, as far as it can; it is imported when it is
+            needed.
         name: Its common name.
         sh_degree: Highest SH degree that it stores.
         metadata: Whether it can store the scene's origin, up direction, unit and antialiasing.
@@ -80,6 +81,15 @@ LOD_FORMATS: tuple[Format, ...] = (
 )
 """Folders with levels of detail, by the whole name of the file that represents them."""
 
+READ_FORMATS: tuple[Format, ...] = (
+    Format(".lcc", "gsplat_edu.io.lcc", "XGRIDS LCC"),
+    Format(".lcc2", "gsplat_edu.io.lcc2", "XGRIDS LCC2"),
+)
+"""Folders of other programs that are read and not written, by the suffix of the file that represents them."""
+
+READ_ONLY = "is read, but not written; choose another format"
+"""Why such a folder is not a scene to write, after the name of the format."""
+
 
 def format_of(path: str | Path) -> Format:
     """Return the format that a file's name indicates.
@@ -93,15 +103,18 @@ def format_of(path: str | Path) -> Format:
     name = Path(path).name.lower()
     if name == SOG_META:
         name = ".sog"
-    for candidate in (*LOD_FORMATS, *FORMATS):
-        if name.endswith(candidate.suffix) and (candidate in FORMATS or name == candidate.suffix):
+    for candidate in (*LOD_FORMATS, *FORMATS, *READ_FORMATS):
+        if name.endswith(candidate.suffix) and (candidate not in LOD_FORMATS or name == candidate.suffix):
             return candidate
     known = ", ".join(candidate.suffix for candidate in (*FORMATS, *LOD_FORMATS))
     raise ArgumentError(f"{path}: unknown scene format; known are {known}")
 
 
 def stored_bytes(path: Path) -> int:
-    """Return the size of a scene on disk in bytes; for a meta.json or lod-meta.json, including its other files."""
+    """Return the size of a scene on disk in bytes; for a folder, that of all files with splats."""
+    for found in READ_FORMATS:
+        if path.name.lower().endswith(found.suffix):
+            return sum(file.stat().st_size for file in importlib.import_module(found.module).files_of(path))
     if path.name.lower() == LOD_META:
         from gsplat_edu.io.lod.codec import stored_bytes as of_all_levels
 
@@ -147,14 +160,16 @@ def file_in(path: Path) -> Path:
     """Return the file that represents a scene stored as a folder; any other path as it is.
 
     Args:
-        path: A SOG, levels of detail, 3D Tiles, or the folder of a model that another program has written; a run of
-            ours is no scene.
+        path: A SOG, levels of detail, 3D Tiles, an LCC, or the folder of a model that another program has written; a
+            run of ours is no scene.
     """
     if not path.is_dir():
         return path
     for name in (SOG_META, LOD_META, TILESET):
         if (path / name).is_file():
             return path / name
+    if len(found := [file for known in READ_FORMATS for file in path.glob(f"*{known.suffix}")]) == 1:
+        return found[0]
     if (path / RUN_CONFIG).is_file():
         return path
     if found := [file for pattern in MODELS for file in path.glob(pattern)]:
@@ -174,7 +189,7 @@ def read_scene(path: str | Path) -> Scene:
 
     Args:
         path: The file; for a SOG folder, the folder or its meta.json; for levels of detail, of which the finest is
-            read, the folder or its lod-meta.json or tileset.json.
+            read, the folder or its lod-meta.json, tileset.json, .lcc or .lcc2.
 
     Returns:
         The scene, float32, in this package's axes.
@@ -201,11 +216,13 @@ def write_scene(path: str | Path, scene: Scene | Gaussians) -> None:
         scene: The scene, or bare Gaussians, in this package's axes.
 
     Raises:
-        ArgumentError: the name has no suffix of a scene format, the scene is neither, or a parameter is NaN or
-            infinite.
+        ArgumentError: the name has no suffix of a format that is written, the scene is neither, or a parameter is NaN
+            or infinite.
         OSError: the file cannot be written. An existing file stays unchanged.
     """
     found = format_of(path)
+    if found in READ_FORMATS:
+        raise ArgumentError(f"{path}: {found.name} {READ_ONLY}")
     if isinstance(scene, Gaussians):
         scene = Scene(scene.map(Tensor.detach))
     of_type("scene", scene, Scene)

@@ -18,6 +18,8 @@ from gsplat_edu.io.formats import (
     FORMATS,
     LOD_FORMATS,
     LOD_META,
+    READ_FORMATS,
+    READ_ONLY,
     SOG_META,
     TILESET,
     format_of,
@@ -96,16 +98,18 @@ def check_target(name: str, path: Path) -> None:
         path: The file.
 
     Raises:
-        ArgumentError: the suffix belongs to no format, or to one whose library is not installed, the path is a folder,
-            or its parent folder is not writable.
+        ArgumentError: the suffix belongs to no format that is written, or to one whose library is not installed, the
+            path is a folder, or its parent folder is not writable.
     """
     if path.suffix.lower() != PAGE:
         try:
-            format_of(path)
+            found = format_of(path)
         except ArgumentError:
-            folders = [f"FOLDER/{name}" for name in (SOG_META, *(found.suffix for found in LOD_FORMATS))]
-            known = ", ".join([*(found.suffix for found in FORMATS), PAGE, *folders])
+            folders = [f"FOLDER/{name}" for name in (SOG_META, *(each.suffix for each in LOD_FORMATS))]
+            known = ", ".join([*(each.suffix for each in FORMATS), PAGE, *folders])
             raise ArgumentError(f"{name}: {path}: unknown scene format; known are {known}") from None
+        if found in READ_FORMATS:
+            raise ArgumentError(f"{name}: {path}: {found.name} {READ_ONLY}")
     if path.suffix.lower() == ".usdc":
         require_usd(f"{name}: {path}")
     if is_points(path):

@@ -7,7 +7,7 @@ import { MatchPanel, readMatches } from "./capture_matches.js";
 import { CapturePanel, numbered, tellFrame } from "./capture_panel.js";
 import { Photos } from "./capture_photos.js";
 import { RegionTool } from "./capture_region.js";
-import { element, fail, say, startPage } from "./common.js";
+import { element, fail, followSize, hasSize, say, startPage } from "./common.js";
 import { Controls } from "./controls.js";
 import { FACTS } from "./facts.js";
 import { inflated } from "./scene.js";
@@ -105,7 +105,7 @@ class CaptureView {
       const action = { Escape: "close", t: "look", x: "leave", m: "matches" }[key];
       if (action && this.cameras.chosen >= 0) this.actions()[action]();
     });
-    addEventListener("resize", () => this.askFrame());
+    followSize(this.canvas, () => this.askFrame());
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.paint());
   }
 
@@ -280,7 +280,7 @@ class CaptureView {
 
   frame(now) {
     this.frameAsked = 0;
-    if (this.lost || !this.renderer) return;
+    if (this.lost || !this.renderer || !hasSize(this.canvas)) return;
     const taken = now - this.lastFrame;
     if (this.controls.advance(Math.min(taken / 1000, 0.1))) this.moved();
     const isMoving = performance.now() - this.movedAt < STILL;

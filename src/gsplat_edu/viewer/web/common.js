@@ -18,6 +18,25 @@ export function fail(error) {
   say(error?.message || String(error));
 }
 
+export const hasSize = ({ clientWidth, clientHeight }) => clientWidth > 0 && clientHeight > 0;
+
+// Calls back whenever the size of an element changes, or how many pixels the screen has for it. Resolves once it has a
+// size: in a frame that is hidden it has none.
+export function followSize(place, resized) {
+  const measured = () => [place.clientWidth, place.clientHeight, devicePixelRatio].join();
+  let last = measured();
+  return new Promise((resolve) => {
+    const look = () => {
+      if (!hasSize(place)) return;
+      if (measured() !== last) resized();
+      last = measured();
+      resolve();
+    };
+    new ResizeObserver(look).observe(place);
+    addEventListener("resize", look); // another screen
+  });
+}
+
 // Runs what makes the page once it is there, and shows the reason if that, or anything later, fails.
 export function startPage(start) {
   addEventListener("error", (event) => fail(event.error));

@@ -1,7 +1,7 @@
 // The page of a scene whose splats it contains.
 
 import { fitted } from "./camera.js";
-import { element, startPage } from "./common.js";
+import { element, followSize, hasSize, startPage } from "./common.js";
 import { FACTS } from "./facts.js";
 import { Headset } from "./headset.js";
 import { unpackSplats } from "./scene.js";
@@ -13,9 +13,9 @@ if (new URLSearchParams(location.search).get("ui") === "0") document.documentEle
 
 // Shows the poster, a picture of the start view, where the first picture will have it.
 function placePoster({ start: { camera }, border, settings }) {
-  const poster = element("poster");
-  if (!poster) return;
-  const { fx, cx, cy } = fitted(camera, innerWidth, innerHeight);
+  const [poster, canvas] = [element("poster"), element("canvas")];
+  if (!poster || !hasSize(canvas)) return;
+  const { fx, cx, cy } = fitted(camera, canvas.clientWidth, canvas.clientHeight);
   const scale = fx / camera.fx;
   const px = { left: cx - scale * (camera.cx + 0.5), top: cy - scale * (camera.cy + 0.5) }; // but for half a pixel
   Object.assign(px, { wide: scale * camera.W, high: scale * camera.H });
@@ -26,6 +26,7 @@ function placePoster({ start: { camera }, border, settings }) {
 
 startPage(async () => {
   placePoster(FACTS);
+  followSize(element("canvas"), () => placePoster(FACTS));
   const splats = await unpackSplats(FACTS, tellUnpacked);
   const viewer = new Viewer(FACTS, splats);
   await showScene(viewer, splats);

@@ -1,7 +1,7 @@
 // The viewer of a page of splats: draws whenever something changes.
 
 import { fitted, pointAt, View } from "./camera.js";
-import { element, fail, say } from "./common.js";
+import { element, fail, followSize, hasSize, say } from "./common.js";
 import { Compare } from "./compare.js";
 import { Controls } from "./controls.js";
 import { Renderer } from "./draw.js";
@@ -56,7 +56,7 @@ export class Viewer {
     this.controls = new Controls(this.canvas, this.view, actions, facts.cameras.length);
     this.panel.mark(this.cameraIndex);
     this.levels?.attach(this.renderer, this.sorter);
-    addEventListener("resize", () => this.refresh());
+    this.sized = followSize(this.canvas, () => this.refresh());
     this.canvas.addEventListener("webglcontextlost", () => this.lose());
     this.askFrame();
   }
@@ -272,9 +272,9 @@ export class Viewer {
     this.askFrame();
   }
 
-  // Whether the page draws nothing: it cannot, or a headset shows the scene.
+  // Whether the page draws nothing: it cannot, its frame is hidden, or a headset shows the scene.
   get paused() {
-    return this.lost || Boolean(this.headset?.session);
+    return this.lost || !(this.exact || hasSize(this.canvas)) || Boolean(this.headset?.session);
   }
 
   askFrame() {
@@ -284,6 +284,7 @@ export class Viewer {
 
   frame(now) {
     this.frameAsked = 0;
+    if (!this.exact && !hasSize(this.canvas)) return;
     const seconds = this.lastFrame ? (now - this.lastFrame) / 1000 : 0;
     if (this.controls.advance(Math.min(seconds, LONGEST_STEP))) this.moved(-1);
     if (this.journey) this.follow(now);
@@ -456,6 +457,7 @@ export class Viewer {
 
 // Shows further parts of the page, then the first picture. `splats`: what the viewer was made of; null with levels of detail.
 export async function showScene(viewer, splats) {
+  await viewer.sized;
   if (FACTS.meshes) viewer.meshes = await Meshes.open(viewer);
   if (FACTS.seen) viewer.seen = await Seen.open(viewer);
   if (FACTS.photos) viewer.compare = await Compare.open(viewer);
