@@ -1,9 +1,10 @@
 // How long a training is, how much memory it takes, and how long it still runs.
 
+import { PLANNED_VIEWS } from "./recipe.js";
+
 export const QUALITIES = { draft: 1, standard: 3, high: 10 }; // multiples of a capture's unit of iterations
 
 const UNIT = 1000; // the numbers of gsplat_edu/train/length.py, which says where they come from
-const PLANNED_VIEWS = 85;
 const RANDOM_START = 1.25;
 const VISITS = 125;
 const LONGEST = 100_000;
