@@ -5,10 +5,12 @@
 namespace gsplat {
 
 constexpr int TILE = 16;
+constexpr double DILATION = 0.3;
 constexpr double DILATION_MAX = 1000000.0;
 constexpr double THINNEST = 1e-06;
 constexpr double ALPHA_MIN = 0.00392156862745098;
 constexpr double ALPHA_MAX = 0.99;
+constexpr double Z_NEAR = 0.05;
 constexpr double T_STOP = 0.0001;
 constexpr double DET_FLOOR = 1e-12;
 constexpr double SPLAT_LIMIT = 1000000000000000.0;

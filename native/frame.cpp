@@ -1,10 +1,8 @@
 #include "frame.h"
 
 #include <algorithm>
-#include <chrono>
 #include <cstring>
 #include <numeric>
-#include <stdexcept>
 
 #include "dispatch.h"
 #include "scan.h"
@@ -20,14 +18,14 @@ class Timer {
   public:
     explicit Timer(StageTime &stage) : stage_(stage) {}
     ~Timer() {
-        stage_.seconds += std::chrono::duration<double>(std::chrono::steady_clock::now() - start_).count();
+        stage_.seconds += wall_seconds() - start_;
         stage_.processor += thread_seconds() - processor_, stage_.parallel += parallel_time().seconds - parallel_;
     }
 
   private:
     StageTime &stage_;
     double processor_ = thread_seconds(), parallel_ = parallel_time().seconds;
-    std::chrono::steady_clock::time_point start_ = std::chrono::steady_clock::now();
+    double start_ = wall_seconds();
 };
 
 }  // namespace
@@ -36,7 +34,7 @@ template <class T>
 Frame<T>::Frame(const Scene<T> &scene, const Camera &camera, const Settings &settings, const uint8_t *needed, int threads)
     : n_(scene.n), camera_(camera), settings_(settings), threads_(threads) {
     grid_.tiles_x = (camera.W + TILE - 1) / TILE, grid_.tiles_y = (camera.H + TILE - 1) / TILE;
-    if (scene.n >= (int64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 Gaussians");
+    if (scene.n >= (int64_t(1) << 32)) refuse("more than 4,294,967,295 Gaussians");
     project(scene);
     sort(scene.order);
     intersect(needed);
@@ -162,7 +160,7 @@ void Frame<T>::intersect(const uint8_t *needed) {
         std::copy(pairs_of + block * BLOCK, pairs_of + std::min((block + 1) * BLOCK, n_), slot_begin + block * BLOCK);
     });
     const uint64_t total = exclusive_sums(threads_, n_, slot_begin);
-    if (total >= (uint64_t(1) << 32)) throw std::length_error("more than 4,294,967,295 pairs of Gaussian and tile");
+    if (total >= (uint64_t(1) << 32)) refuse("more than 4,294,967,295 pairs of Gaussian and tile");
     pairs_count_ = int64_t(total);
     lay_out(threads_, tiles, chunks, table, static_cast<uint32_t *>(tile_begin_.reserve(size_t(tiles + 1) * 4)));
     args.pairs = static_cast<Pair *>(pairs_.reserve((size_t(total) + 1) * sizeof(Pair)));

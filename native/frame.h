@@ -1,12 +1,23 @@
 // One rendered view: its buffers and the order of its stages, from projection to gradients. Kernels do the work.
 #pragma once
 
+#include <algorithm>
 #include <array>
+#include <cmath>
 
 #include "buffers.h"
 #include "kernels.h"
 
 namespace gsplat {
+
+// Sets what follows from the other numbers of a camera, and from its exposure: the time a row is exposed, by that of the readout.
+inline void complete(Camera &camera, double exposure) {
+    const double bounds[4] = {camera.x_low, camera.x_high, camera.y_low, camera.y_high};
+    camera.bounded = camera.lens == PERSPECTIVE && std::any_of(bounds, bounds + 4, [](double b) { return std::isfinite(b); });
+    camera.spread = camera.moving ? exposure / std::sqrt(12.0) : 0.0;
+    camera.along_ray = camera.lens == FISHEYE || camera.lens == EQUIRECTANGULAR;
+    camera.middle = 0.5 * ((camera.axis == 0 ? camera.W : camera.H) - 1);
+}
 
 // Statistics of every Gaussian, in the order of `Statistic`, and the error of every pixel that one of them weighs.
 template <class T>

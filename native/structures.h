@@ -22,10 +22,10 @@ const S &struct_of(Arguments &a, const char *name) {
     return *found;
 }
 
-// What follows a pinhole's numbers; of a pinhole at rest, nothing does.
-inline void read_lens(Arguments &a, Camera &cam) {
+// What follows a pinhole's numbers; of a pinhole at rest, nothing does. Returns the exposure.
+inline double read_lens(Arguments &a, Camera &cam) {
     cam.lens = PINHOLE;
-    if (!a.has("lens")) return;
+    if (!a.has("lens")) return 0;
     std::array<double, 6> motion;
     cam.lens = Lens(a.whole("lens", PERSPECTIVE, ORTHOGRAPHIC));
     a.numbers("coefficients", cam.coefficients, COEFFICIENTS), a.numbers("motion", motion.data(), 6);
@@ -33,15 +33,13 @@ inline void read_lens(Arguments &a, Camera &cam) {
     cam.axis = int32_t(a.whole("axis", 0, 1)), cam.pace = a.number("pace"), cam.widest = a.number("widest");
     const double exposure = a.number("exposure");
     if (!(exposure >= 0 && std::isfinite(exposure))) a.fail("exposure", "has to be finite and at least 0");
-    cam.spread = cam.moving ? exposure / std::sqrt(12.0) : 0.0;
     if (cam.distorted && cam.lens > FISHEYE) a.fail("distorted", "has to be false for this lens");
-    cam.along_ray = cam.lens == FISHEYE || cam.lens == EQUIRECTANGULAR;
-    cam.middle = 0.5 * ((cam.axis == 0 ? cam.W : cam.H) - 1);
     std::copy_n(motion.data(), 3, cam.turn), std::copy_n(motion.data() + 3, 3, cam.shift);
     for (const double c : cam.coefficients)
         if (!std::isfinite(c)) a.fail("coefficients", "have to be finite");
     for (const double c : motion)
         if (!std::isfinite(c)) a.fail("motion", "has to be finite");
+    return exposure;
 }
 
 inline Camera camera_of(Arguments a) {
@@ -58,9 +56,7 @@ inline Camera camera_of(Arguments a) {
     cam.H = int32_t(a.whole("H", 1, MOST)), cam.W = int32_t(a.whole("W", 1, MOST));
     const int64_t tiles = ((int64_t(cam.H) + TILE - 1) / TILE) * ((int64_t(cam.W) + TILE - 1) / TILE);
     if (tiles > MOST) a.fail("H", "times W is more pixels than can be rendered");
-    read_lens(a, cam);
-    const double bounds[4] = {cam.x_low, cam.x_high, cam.y_low, cam.y_high};
-    cam.bounded = cam.lens == PERSPECTIVE && std::any_of(bounds, bounds + 4, [](double b) { return std::isfinite(b); });
+    complete(cam, read_lens(a, cam));
     a.finish();
     return cam;
 }

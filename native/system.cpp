@@ -1,5 +1,8 @@
 #include "system.h"
 
+#include <chrono>
+#include <stdexcept>
+
 #if defined(_WIN32)
 #define WIN32_LEAN_AND_MEAN
 #define NOMINMAX
@@ -15,6 +18,10 @@
 #endif
 
 namespace gsplat {
+
+double wall_seconds() { return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count(); }
+
+void refuse(const char *reason) { throw std::length_error(reason); }
 
 #if defined(_WIN32)
 

@@ -17,10 +17,12 @@ ROOT = Path(__file__).resolve().parent.parent
 HEADER = ROOT / "native" / "constants.h"
 WGSL = ROOT / "src" / "gsplat_edu" / "engine" / "constants.wgsl"
 NAMES = (
+    "DILATION",
     "DILATION_MAX",
     "THINNEST",
     "ALPHA_MIN",
     "ALPHA_MAX",
+    "Z_NEAR",
     "T_STOP",
     "DET_FLOOR",
     "SPLAT_LIMIT",
