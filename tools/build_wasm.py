@@ -2,8 +2,8 @@
 
     python tools/build_wasm.py [--check]
 
-It compiles native/ and wasm/ with the ziglang of the extra `dev`, a minute of processor time at first, and does nothing if the module is
-newer than its sources. `--check` compiles nothing: it exits with 1 if the module is missing or older.
+It compiles native/ and wasm/ with the ziglang of the extra `dev`, a minute of processor time at first, and does nothing
+if the module was made from these sources. `--check` compiles nothing, and exits with 1 if the module is missing or old.
 """
 
 from __future__ import annotations

@@ -1,25 +1,25 @@
-"""Write the settings of the recipe fast for the WebAssembly trainer from `gsplat_edu.train.config`, so that each is defined once.
+"""Write the settings of the recipe fast for the WebAssembly trainer, so that each is defined once.
 
     python tools/generate_recipe.py
 
-It writes wasm/recipe.h, a structure whose numbers have the order of `fields`, and src/gsplat_edu/tab/web/recipe.js, their values for
-30,000 iterations and which of them scale with the length of a run. A test compares the files with this script's output.
+They come from `gsplat_edu.train`. It writes wasm/recipe.h, a structure whose numbers have the order of `FIELDS`, and
+src/gsplat_edu/tab/web/recipe.js, their values for 30,000 iterations and which of them scale with the length of a run. A
+test compares the files with this script's output.
 """
 
 from __future__ import annotations
 
-import json
+import re
 from pathlib import Path
 
+from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS, SEPARATE
 from gsplat_edu.train.config import (
     FAST_DENSIFICATIONS,
     MILESTONES,
     RECIPE_ITERATIONS,
-    SETTINGS,
     TrainConfig,
     recipe,
 )
-from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS, SEPARATE
 from gsplat_edu.train.feed import SMALLEST_SIDE
 from gsplat_edu.train.initialize import NEIGHBOURS, SMALLEST_DISTANCE, START_SCALE
 from gsplat_edu.train.objective import FEW_VISIBLE
@@ -98,15 +98,24 @@ def module() -> str:
     lines = [
         "// Made by tools/generate_recipe.py from src/gsplat_edu/train. Do not edit.",
         "",
-        *(f"export const {name} = {value!r};" for name, value in numbers.items()),
+        *(f"export const {name} = {_written(value)};" for name, value in numbers.items()),
         "",
         "// The settings of the recipe fast for RECIPE_ITERATIONS, in the order in which the module reads them.",
-        f"export const RECIPE = {json.dumps(values(), indent=2)};",
+        "export const RECIPE = {",
+        *(f"  {name}: {_written(value)}," for name, value in values().items()),
+        "};",
         "",
         "// Those that scale with the length of a run.",
-        f"export const MILESTONES = {json.dumps(scaled, indent=2)};",
+        "export const MILESTONES = [",
+        *(f'  "{name}",' for name in scaled),
+        "];",
     ]
     return "\n".join([*lines, ""])
+
+
+def _written(value: float) -> str:
+    """Return a number as JavaScript's formatter writes it: 1.6e-5, not 1.6e-05."""
+    return re.sub(r"e-0(\d)$", r"e-\1", repr(value))
 
 
 if __name__ == "__main__":

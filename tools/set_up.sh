@@ -16,7 +16,7 @@ fail() {
 }
 
 # A stamp is written last, so that an interrupted set-up is done again.
-stamp=$(cat pyproject.toml constraints.txt CMakeLists.txt native/* | cksum)
+stamp=$(cat pyproject.toml constraints.txt CMakeLists.txt native/* wasm/* tools/build_wasm.py | cksum)
 stands() { [ "$(cat ".venv/.set-up-$1" 2> /dev/null)" = "$stamp" ]; }
 
 # A .venv is used if it runs, was not moved here from elsewhere, and has the Python that was asked for.
@@ -46,6 +46,10 @@ extra=
 echo "== set-up: installing gsplat_edu$extra with the versions in constraints.txt"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".$extra" ||
     fail "the installation failed; the lines above say why"
+if [ "$purpose" = dev ]; then
+    echo "== set-up: building the module for browsers"
+    .venv/bin/python tools/build_wasm.py || fail "the module for browsers was not built; the line above says why"
+fi
 echo "$stamp" > ".venv/.set-up-$purpose"
 if [ "$purpose" = dev ] && [ -e .git ] && ! git config --get core.hooksPath > /dev/null; then
     git config core.hooksPath tools/hooks

@@ -70,7 +70,11 @@ export async function loadModule(source, { limit = DEFAULT_LIMIT } = {}) {
     },
     now: () => performance.now(),
   };
-  const { exports } = await WebAssembly.instantiate(compiled, { env: { memory }, host, wasi_snapshot_preview1: NO_FILES });
+  const { exports } = await WebAssembly.instantiate(compiled, {
+    env: { memory },
+    host,
+    wasi_snapshot_preview1: NO_FILES,
+  });
   exports._initialize();
   return new Module(exports, memory);
 }
@@ -132,14 +136,29 @@ class Module {
 export function cameraNumbers(camera, jacobianLimit = null) {
   const { R, eye, fx, fy, cx, cy, W, H, projection = "pinhole" } = camera;
   const kind = PROJECTIONS.indexOf(projection);
-  if (R?.length !== 9 || eye?.length !== 3) throw new EngineError("a camera needs a rotation of 9 numbers and a place of 3");
+  if (R?.length !== 9 || eye?.length !== 3)
+    throw new EngineError("a camera needs a rotation of 9 numbers and a place of 3");
   if (kind < 0) throw new EngineError(`the projection ${projection} is unknown; there are ${PROJECTIONS.join(", ")}`);
   const bounds = camera.bounds ?? [...bound(W, cx, fx, jacobianLimit), ...bound(H, cy, fy, jacobianLimit)];
   const distortion = camera.distortion ?? new Array(15).fill(0);
-  const numbers = [...R, ...eye, fx, fy, cx, cy, W, H, ...bounds, kind, camera.distortion ? 1 : 0, camera.radialFirst ? 1 : 0];
+  const numbers = [
+    ...R,
+    ...eye,
+    fx,
+    fy,
+    cx,
+    cy,
+    W,
+    H,
+    ...bounds,
+    kind,
+    camera.distortion ? 1 : 0,
+    camera.radialFirst ? 1 : 0,
+  ];
   numbers.push(camera.moving ? 1 : 0, camera.axis ?? 0, camera.pace ?? 0, camera.widest ?? 0, camera.exposure ?? 0);
   numbers.push(...distortion, ...(camera.motion ?? new Array(6).fill(0)));
-  if (numbers.length !== CAMERA_NUMBERS) throw new EngineError("a lens needs 15 coefficients and 6 numbers of its motion");
+  if (numbers.length !== CAMERA_NUMBERS)
+    throw new EngineError("a lens needs 15 coefficients and 6 numbers of its motion");
   return Float64Array.from(numbers);
 }
 
@@ -150,8 +169,23 @@ function bound(size, middle, focal, limit) {
 }
 
 function settingNumbers(settings = {}) {
-  const { zNear = 0.05, background = [0, 0, 0], shDegree = 3, antialiased = false, dilation = 0.3, alphaMax = 0.99 } = settings;
-  return Float64Array.from([zNear, ...background, shDegree, antialiased ? 1 : 0, dilation, alphaMax, settings.pixelStop ? 1 : 0]);
+  const {
+    zNear = 0.05,
+    background = [0, 0, 0],
+    shDegree = 3,
+    antialiased = false,
+    dilation = 0.3,
+    alphaMax = 0.99,
+  } = settings;
+  return Float64Array.from([
+    zNear,
+    ...background,
+    shDegree,
+    antialiased ? 1 : 0,
+    dilation,
+    alphaMax,
+    settings.pixelStop ? 1 : 0,
+  ]);
 }
 
 /**
@@ -167,14 +201,17 @@ function settingNumbers(settings = {}) {
 export function render(module, gaussians, camera, settings = {}, upstream = null) {
   const Type = gaussians.means.constructor;
   const suffix = Type === Float64Array ? "f64" : "f32";
-  if (Type !== Float64Array && Type !== Float32Array) throw new EngineError("means have to be a Float32Array or a Float64Array");
+  if (Type !== Float64Array && Type !== Float32Array)
+    throw new EngineError("means have to be a Float32Array or a Float64Array");
   const count = gaussians.logit_opacities.length;
   const rest = count ? gaussians.sh_rest.length / (3 * count) : (settings.rest ?? 0);
   const channels = gaussians.features && count ? gaussians.features.length / count : 0;
   const widths = { means: 3, quats: 4, log_scales: 3, sh0: 3, sh_rest: 3 * rest, logit_opacities: 1 };
   for (const [name, width] of Object.entries(widths)) {
     if (!(gaussians[name] instanceof Type) || gaussians[name].length !== width * count) {
-      throw new EngineError(`${name}: has to have ${width} numbers for each of ${count} splats, of the same kind as means`);
+      throw new EngineError(
+        `${name}: has to have ${width} numbers for each of ${count} splats, of the same kind as means`,
+      );
     }
   }
   const pixels = camera.W * camera.H;
@@ -188,11 +225,13 @@ export function render(module, gaussians, camera, settings = {}, upstream = null
       rooms.features = given(Type, gaussians.features);
       rooms.mixed = room(Type, channels * pixels);
     }
-    const numbers = camera.projection && camera.projection !== "pinhole" ? GRADIENT_NUMBERS.lens : GRADIENT_NUMBERS.pinhole;
+    const numbers =
+      camera.projection && camera.projection !== "pinhole" ? GRADIENT_NUMBERS.lens : GRADIENT_NUMBERS.pinhole;
     if (upstream) {
       for (const [name, width] of Object.entries(widths)) rooms[`grad_${name}`] = room(Type, width * count);
       rooms.grad_image = given(Type, upstream.image ?? new Type(3 * pixels));
-      for (const name of ["transmittance", "depth"]) if (upstream[name]) rooms[`grad_${name}`] = given(Type, upstream[name]);
+      for (const name of ["transmittance", "depth"])
+        if (upstream[name]) rooms[`grad_${name}`] = given(Type, upstream[name]);
       if (channels && upstream.features) {
         rooms.grad_mixed = given(Type, upstream.features);
         rooms.grad_features = room(Type, channels * count);
@@ -238,10 +277,13 @@ function roundEven(x) {
  * @param changes Settings by the names of RECIPE; they are not scaled.
  */
 export function recipe(iterations, changes = {}) {
-  if (!Number.isInteger(iterations) || iterations < 1) throw new EngineError("iterations have to be a whole number of at least 1");
+  if (!Number.isInteger(iterations) || iterations < 1)
+    throw new EngineError("iterations have to be a whole number of at least 1");
   const unknown = Object.keys(changes).find((name) => !(name in RECIPE));
   if (unknown) throw new EngineError(`the setting ${unknown} is unknown`);
-  const scaled = Object.fromEntries(MILESTONES.map((name) => [name, Math.max(1, roundEven((RECIPE[name] * iterations) / RECIPE_ITERATIONS))]));
+  const scaled = Object.fromEntries(
+    MILESTONES.map((name) => [name, Math.max(1, roundEven((RECIPE[name] * iterations) / RECIPE_ITERATIONS))]),
+  );
   scaled.densify_every = Math.min(Math.max(Math.floor(iterations / FAST_DENSIFICATIONS), 1), DENSIFY_EVERY);
   return { ...RECIPE, iterations, ...scaled, ...changes };
 }
@@ -278,7 +320,8 @@ export class Trainer {
    */
   constructor(module, { points, colors, views, extent = null, settings }) {
     if (!views?.length) throw new EngineError("there is no photo to learn from");
-    if (points.length !== colors.length || points.length % 3) throw new EngineError("points and colours have to be 3 numbers each, and as many");
+    if (points.length !== colors.length || points.length % 3)
+      throw new EngineError("points and colours have to be 3 numbers each, and as many");
     const cameras = views.map((view) => view.camera);
     const pixels = cameras.reduce((sum, { W, H }) => sum + W * H, 0) / cameras.length;
     const planned = settings.maxGaussians ?? Math.max(plannedGaussians(pixels, views.length), 1);
@@ -304,7 +347,8 @@ export class Trainer {
   }
 
   addView({ name, camera, pixels }) {
-    if (pixels.length !== 3 * camera.W * camera.H) throw new EngineError(`${name}: has another number of pixels than its camera`);
+    if (pixels.length !== 3 * camera.W * camera.H)
+      throw new EngineError(`${name}: has another number of pixels than its camera`);
     this.withPhoto(camera, pixels, (numbers, photo) => this.module.calls.add_view(this.handle, numbers, photo));
   }
 
@@ -387,7 +431,9 @@ export class Trainer {
 
   /** Continues from a state that a training with the same photos and settings wrote. */
   load(bytes) {
-    this.module.withRoom(({ given }) => this.module.calls.load(this.handle, given(Uint8Array, bytes).address, bytes.length));
+    this.module.withRoom(({ given }) =>
+      this.module.calls.load(this.handle, given(Uint8Array, bytes).address, bytes.length),
+    );
   }
 
   /** A trainer that continues from a state. */
