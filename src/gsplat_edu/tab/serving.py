@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 
 from starlette.datastructures import MutableHeaders
@@ -12,6 +10,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from gsplat_edu.base.constants import LOOPBACK
 from gsplat_edu.base.errors import ArgumentError
 from gsplat_edu.server.page_server import TYPES, PageServer
+
+PACKAGE = Path(__file__).parents[1]
+"""The folder of the package."""
 
 MODULE = "gsplat_edu.wasm"
 """The compiled kernels and trainer, a file beside the page's scripts."""
@@ -53,9 +54,6 @@ class TabServer(PageServer):
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
         found = page_files()
-        if f"/tab/web/{MODULE}" not in found:
-            missing = Path(str(files("gsplat_edu.tab") / "web" / MODULE))
-            raise ArgumentError(f"{missing}: is not built; run python tools/build_wasm.py in the repository")
         super().__init__(POLICY, host, port)
         self.page = found["/tab/web/index.html"].read_bytes()
         self.served = found
@@ -75,11 +73,22 @@ class TabServer(PageServer):
         return isolated
 
 
-def page_files() -> Mapping[str, Path]:
-    """Return the files that the page may load, by their addresses."""
-    found = {}
+def page_files(package: Path = PACKAGE) -> dict[str, Path]:
+    """Return the files that the page may load, by their addresses.
+
+    Args:
+        package: The folder of the package.
+
+    Raises:
+        ArgumentError: the module is not built.
+    """
+    module = package / "tab" / "web" / MODULE
+    if not module.is_file():
+        raise ArgumentError(
+            f"{module}: is not built; run python tools/build_wasm.py in a clone of the repository"
+        )
+    found = {EXAMPLE: package / "studio" / "example.zip"}
     for room in ROOMS:
-        folder = Path(str(files("gsplat_edu") / room / "web"))
-        found |= {f"/{room}/web/{path.name}": path for path in folder.iterdir() if path.suffix in TYPES}
-    example = Path(str(files("gsplat_edu") / "studio" / "example.zip"))
-    return found | {EXAMPLE: example}
+        files = (package / room / "web").iterdir()
+        found |= {f"/{room}/web/{path.name}": path for path in files if path.suffix in TYPES}
+    return found

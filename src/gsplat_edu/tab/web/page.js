@@ -9,7 +9,7 @@ const LENGTHS = { draft: "Draft", standard: "Standard", high: "High" };
 const SIZES = { 480: "480 px", 800: "800 px", 1200: "1200 px" };
 const PHONE = { most: 40_000, longest: 480, quality: "draft" };
 const DESKTOP = { most: null, longest: 800, quality: "standard" };
-const RENDER_NOTE = "Not used for the training: it shows whether new views are right.";
+const HELD_OUT = "This photo is not used for the training: it shows whether new views are right.";
 
 const start = matchMedia("(max-width: 600px), (pointer: coarse)").matches ? PHONE : DESKTOP;
 
@@ -102,7 +102,7 @@ function leave() {
 
 // What the worker says, by its first word.
 const heard = {
-  done: ({ did }) => did === "open" && prepare({}),
+  done: ({ did }) => did === "open" && state.stage === "reading" && prepare({}),
   found: (found) => state.stage === "intake" && change({ found }),
   reading: ({ done, total }) => change({ reading: { done, total } }),
   note: ({ text }) => change({ notes: [...state.notes, text] }),
@@ -198,7 +198,13 @@ function reading() {
   const { reading: at, name } = state;
   const [done, total] = at ? [at.done, at.total] : [0, 0];
   const text = at ? `Preparing photo ${Math.min(done + 1, total)} of ${total}` : "Reading the poses";
-  return want("section", { "aria-label": "Reading" }, want("h2", {}, name), bar(text, total ? done / total : null));
+  return want(
+    "section",
+    { "aria-label": "Reading" },
+    want("h2", {}, name),
+    bar(text, total ? done / total : null),
+    want("div", { class: "row" }, button("Cancel", leave, { class: "wide" })),
+  );
 }
 
 // A bar with what it waits for; without a value, it is unknown how far it is.
@@ -214,7 +220,7 @@ function pictures() {
   const { facts, picture } = state;
   const at = picture?.at ?? 0;
   const show = (next) => () => tell({ do: "show", at: (next + facts.compared) % facts.compared });
-  const held = facts.heldOut ? RENDER_NOTE : "";
+  const held = facts.heldOut ? HELD_OUT : "";
   const arrows = [
     [-1, "previous", "Previous photo"],
     [1, "next", "Next photo"],
@@ -234,7 +240,7 @@ function pictures() {
       "p",
       { class: "row small" },
       facts.compared > 1 && arrows,
-      want("span", { class: "quiet" }, picture ? `${picture.name}. ${held}` : ""),
+      want("span", { class: "quiet" }, picture ? `${picture.name.split("/").at(-1)}. ${held}` : ""),
     ),
   );
 }
@@ -268,16 +274,14 @@ function choices() {
     "div",
     { class: "row choices" },
     segments("Length", LENGTHS, quality, (value) => prepare({ quality: value })),
-    segments("Photos", SIZES, longest, (value) => prepare({ longest: Number(value) })),
+    segments("Photo size", SIZES, longest, (value) => prepare({ longest: Number(value) })),
   );
 }
 
 function forecastText() {
-  const { forecast, stage } = state;
+  const { forecast } = state;
   if (!forecast) return bar("Trying the first steps", null);
-  const text = `About ${duration(forecast.seconds)}, and ${bytes(forecast.bytes)} of memory.`;
-  const asleep = "Keep this tab in front: browsers slow down the others.";
-  return want("p", {}, text, " ", stage === "ready" && want("span", { class: "quiet" }, asleep));
+  return want("p", {}, `About ${duration(forecast.seconds)}, and ${bytes(forecast.bytes)} of memory.`);
 }
 
 const ready = () => [

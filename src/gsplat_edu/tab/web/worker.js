@@ -2,7 +2,7 @@
 // {do, ...}, a method of `acts`; each one from it is {say, ...}.
 
 import { readCapture } from "./capture.js";
-import { loadModule, Trainer } from "./engine.js";
+import { loadModule, plannedGaussians, Trainer } from "./engine.js";
 import { bytesNeeded, plannedIterations, secondsLeft } from "./length.js";
 import { decodedView } from "./photos.js";
 import { plyOf } from "./ply.js";
@@ -30,21 +30,16 @@ const pause = () => new Promise((resolve) => setTimeout(resolve));
 
 let dropped = null; // {name, capture}: what was read last, for other sizes and lengths
 let training = null;
+let request = 0; // number of the newest message that asks for another training
 let isKeeping = false; // whether this tab keeps its training; of several tabs only the first does
+
+// What an older request ends with once a newer one replaces it.
+class Replaced extends Error {}
 
 // One training: its views and settings, and the trainer.
 class Training {
   constructor(module, given, state = null) {
-    Object.assign(this, {
-      given,
-      isRunning: false,
-      isEnding: false,
-      perStep: 0,
-      shown: 0,
-      kept: 0,
-      drawn: 0,
-      drawing: 0,
-    });
+    Object.assign(this, { given, run: 0, perStep: 0, shown: 0, kept: 0, drawn: 0, drawing: 0 });
     const { views, points, colors, settings } = given;
     this.training = views.filter(({ part }) => part === "train");
     this.heldOut = views.filter(({ part }) => part === "test");
@@ -57,13 +52,13 @@ class Training {
     return this.given.settings.iterations - this.trainer.iteration;
   }
 
-  // Steps, and measures how long one takes.
+  // Takes at most `count` steps, and measures how long one takes.
   step(count) {
+    const steps = Math.min(count, this.steps);
     const began = seconds();
-    this.last = this.trainer.step(Math.min(count, this.steps));
-    const perStep = (seconds() - began) / count;
+    this.last = this.trainer.step(steps);
+    const perStep = (seconds() - began) / steps;
     this.perStep = this.perStep ? 0.8 * this.perStep + 0.2 * perStep : perStep;
-    return this.last;
   }
 
   get left() {
@@ -108,18 +103,22 @@ class Training {
     this.drawn = seconds();
   }
 
-  async run() {
-    if (this.isRunning) return;
-    this.isRunning = true;
-    while (this.isRunning && this.steps > 0) {
+  // Steps until the end, or until another run or `stop` takes over.
+  async train() {
+    this.run += 1;
+    const mine = this.run;
+    while (this.run === mine && this.steps > 0) {
       this.step(Math.max(1, Math.min(MOST_STEPS, Math.round(CHUNK / this.perStep))));
       this.progress();
       if (seconds() - this.drawn > Math.max(PICTURE, this.drawing / PICTURE_SHARE)) this.picture();
       if (seconds() - this.kept > KEEP) await this.keep();
       await pause();
     }
-    if (this.isRunning) await this.end();
-    this.isRunning = false;
+    if (this.run === mine) await this.end();
+  }
+
+  stop() {
+    this.run += 1;
   }
 
   async keep() {
@@ -131,6 +130,7 @@ class Training {
   // Compares photos with renders, and says the verdict.
   async end() {
     await this.keep();
+    if (training !== this) return;
     this.picture(true);
     const every = Math.ceil(this.training.length / MOST_SCORED);
     const trained = this.training.filter((_, i) => i % every === 0);
@@ -150,7 +150,7 @@ class Training {
   }
 
   free() {
-    this.isRunning = false;
+    this.stop();
     this.trainer.free();
   }
 }
@@ -177,20 +177,23 @@ async function kept(act) {
   }
 }
 
-// Decodes the photos of the capture that was read last.
+// Decodes the photos of a capture.
 async function viewsOf(frames, longest) {
+  const mine = request;
   const used = frames.filter(({ part }) => part !== "left out");
   const views = [];
   for (const frame of used) {
     say({ say: "reading", done: views.length, total: used.length });
     views.push(await decodedView(frame, longest));
+    if (request !== mine) throw new Replaced();
   }
   return views;
 }
 
-function replace(next) {
+// Ends the training and releases its memory.
+function release() {
   training?.free();
-  training = next;
+  training = null;
 }
 
 const module = loadModule(new URL("./gsplat_edu.wasm", import.meta.url), { threads: 1, limit: LIMIT });
@@ -198,18 +201,16 @@ module.catch(() => {}); // `begin` says so
 
 // Makes the trainer, tries some steps and says how long all of them take.
 async function begin(given, state = null) {
-  replace(new Training(await module, given, state));
+  const loaded = await module;
+  release();
+  training = new Training(loaded, given, state);
   const mine = training;
   say({ say: "opened", ...mine.facts });
   mine.picture(true);
-  if (!mine.steps) {
-    await mine.end();
-    return;
-  }
   for (let i = 0; i < TRIAL && mine.steps > 1; ++i) {
     mine.step(1);
     await pause();
-    if (training !== mine) return;
+    if (training !== mine) throw new Replaced();
   }
   const { planned } = mine.trainer;
   say({ say: "forecast", seconds: mine.left, bytes: bytesNeeded(given.views, planned), gaussians: planned });
@@ -228,41 +229,52 @@ const acts = {
   },
 
   async open({ files, name }) {
+    request += 1;
+    const mine = request;
     const single = files.length === 1 && (await isZip(files[0].file));
-    dropped = { name, capture: await readCapture(single ? await unzipped(files[0].file) : files) };
+    const capture = await readCapture(single ? await unzipped(files[0].file) : files);
+    if (request !== mine) throw new Replaced();
+    dropped = { name, capture };
   },
 
   // Prepares what was opened for a length and a size of photos. most: limit of the Gaussians, or null.
   async prepare({ quality, longest, most }) {
+    request += 1;
     const { name, capture } = dropped;
-    replace(null);
+    release();
     const views = await viewsOf(capture.frames, longest);
     const trained = views.filter(({ part }) => part === "train");
     const measured = Boolean(capture.cloud?.points.length);
     const { points, colors } = measured ? capture.cloud : randomPoints(trained.map(({ camera }) => camera));
     const iterations = plannedIterations(quality, trained.length, measured);
-    const settings = { iterations, ...(most && { maxGaussians: most }), seed: 0 };
+    const pixels = trained.reduce((sum, { camera: { W, H } }) => sum + W * H, 0) / trained.length;
+    const isLimited = most !== null && plannedGaussians(pixels, trained.length) > most;
+    const settings = { iterations, seed: 0, ...(isLimited && { maxGaussians: most }) };
     await begin({ name, views, points, colors, settings, quality, longest, measured, notes: capture.notes });
   },
 
   async start() {
     const mine = training;
-    if (isKeeping && !mine.kept) await kept(() => keepCapture(mine.given));
-    await mine.run();
+    if (isKeeping && !mine.kept) {
+      await kept(() => keepCapture(mine.given));
+      await mine.keep();
+    }
+    await mine.train();
   },
 
   pause() {
-    training.isRunning = false;
+    training.stop();
     return training.keep();
   },
 
-  keep: () => training?.trainer && training.kept && training.keep(),
+  keep: () => training?.kept && training.keep(),
 
   async resume() {
+    request += 1;
     const { capture, state } = await keptTraining();
     await begin(capture, state.bytes);
     training.kept = seconds();
-    await training.run();
+    await training.train();
   },
 
   show({ at }) {
@@ -275,7 +287,8 @@ const acts = {
   },
 
   async close() {
-    replace(null);
+    request += 1;
+    release();
     if (isKeeping) await forget();
   },
 };
@@ -296,6 +309,7 @@ addEventListener("message", async ({ data }) => {
     await acts[data.do](data);
     say({ say: "done", did: data.do });
   } catch (error) {
+    if (error instanceof Replaced) return;
     const isKnown = error instanceof CaptureError;
     if (!isKnown) console.error(error);
     say({ say: "error", did: data.do, text: isKnown ? error.message : `This did not work: ${error.message}` });
