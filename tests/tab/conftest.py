@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 import build_wasm
-from tab.hosts import Host
+from wasm_host import Host
 
 
 @pytest.fixture(scope="session")

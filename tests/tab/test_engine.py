@@ -17,7 +17,7 @@ from gsplat_edu.scene.rig import scene_extent
 from gsplat_edu.scene.shutter import RollingShutter, readout_axis, readout_pace
 from gsplat_edu.train.capacity import planned_gaussians
 from gsplat_edu.train.config import recipe
-from tab.hosts import EngineError, Host
+from wasm_host import EngineError, Host
 
 MOST_BYTES = 1_500_000
 """Bound of the module, gzipped."""

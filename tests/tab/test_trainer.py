@@ -12,27 +12,7 @@ from gsplat_edu.render.settings import RenderSettings
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.train.compose import training
 from gsplat_edu.train.config import recipe
-from tab.hosts import EngineError, Host
-
-
-def camera_of(camera):
-    """A pinhole as engine.js takes it."""
-    plain = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
-    plain |= {"W": camera.W, "H": camera.H}
-    return plain | {"R": list(map(float, np.ravel(camera.R))), "eye": list(map(float, camera.eye))}
-
-
-def view_of(view):
-    """A view as engine.js takes it."""
-    image = view.read().image
-    pixels = image if image.dtype == np.uint8 else np.round(255 * image).astype(np.uint8)
-    return {"name": view.name, "camera": camera_of(view.camera), "pixels": pixels.ravel()}
-
-
-def options_of(views, points, colors, **settings):
-    """A training's options."""
-    arrays = {"points": np.ravel(points).astype(np.float64), "colors": np.ravel(colors).astype(np.float64)}
-    return {**arrays, "views": [view_of(view) for view in views], "settings": settings}
+from wasm_host import EngineError, Host, camera_of, options_of, view_of
 
 
 def gaussians_of(found):

@@ -1,4 +1,4 @@
-// Runs the WebAssembly module in node for the tests in Python: a request of JSON a line on the standard input, an answer a line back.
+// Runs the WebAssembly module in node for tests and benchmarks in Python: a request of JSON a line on the standard input, an answer a line back.
 // Arrays travel as { type, bytes (base64) }.
 
 import { readFileSync } from "node:fs";
@@ -53,6 +53,7 @@ const calls = {
   facts: () => ({
     imports: WebAssembly.Module.imports(compiled).map(({ module, name }) => `${module}.${name}`),
     bytes: module?.bytes ?? 0,
+    seconds: (process.cpuUsage().user + process.cpuUsage().system) / 1e6,
   }),
 };
 
