@@ -93,12 +93,19 @@ def test_trainings_are_as_long_as_in_python():
 
 
 def test_what_is_left_counts_the_growth():
-    """Half of a step's time grows with the Gaussians: from 100 to 300 of them, the mean step is 1.5 times as long."""
-    cases = [
-        {"steps": 10, "perStep": 2, "count": n, "planned": m} for n, m in ((100, 100), (100, 300), (300, 100))
+    """Three quarters of a step's time grow with the Gaussians, whose number grows evenly until 0.6 of the training.
+
+    From 100 to 300 Gaussians, the mean of all steps is 0.6 * 200 + 0.4 * 300 = 240, so a step takes
+    1/4 + 3/4 * 2.4 = 2.05 times as long as the first; after half of the training, with 200 of them, it is
+    0.2 * 250 + 0.8 * 300 = 290, 1/4 + 3/4 * 1.45; after 0.6, all steps are alike.
+    """
+    cases = [(100, 100, 100), (100, 100, 300), (50, 200, 300), (40, 300, 300), (40, 300, 400), (0, 300, 300)]
+    given = [
+        {"steps": steps, "iterations": 100, "perStep": 2, "count": count, "planned": planned}
+        for steps, count, planned in cases
     ]
-    body = "return given.map(secondsLeft);"
-    assert answer("length.js", "secondsLeft", body, cases) == [20, 30, 20]
+    found = answer("length.js", "secondsLeft", "return given.map(secondsLeft);", given)
+    np.testing.assert_allclose(found, [200, 410, 100 * (0.25 + 0.75 * 1.45), 80, 80, 0], rtol=1e-12)
 
 
 def test_verdicts_are_those_of_python():

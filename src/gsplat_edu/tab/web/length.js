@@ -1,6 +1,6 @@
 // How long a training is, how much memory it takes, and how long it still runs.
 
-import { PLANNED_VIEWS } from "./recipe.js";
+import { PLANNED_VIEWS, RECIPE, RECIPE_ITERATIONS } from "./recipe.js";
 
 export const QUALITIES = { draft: 1, standard: 3, high: 10 }; // multiples of a capture's unit of iterations
 
@@ -9,7 +9,8 @@ const RANDOM_START = 1.25;
 const VISITS = 125;
 const LONGEST = 100_000;
 
-const GROWING = 0.5; // share of a step's time that is proportional to the Gaussians; the rest is to the pixels
+const GROWN = RECIPE.fast_full_size / RECIPE_ITERATIONS; // share of a training after which it has all its Gaussians
+const GROWING = 0.75; // share of a step's time that is proportional to the Gaussians, measured on the example
 const GAUSSIAN = 59 * 4 * 4; // bytes: parameters up to degree 3, gradients and two moments, float32
 const FRAME = 400; // bytes for each pixel of the largest photo: lists of tiles, images and their gradients
 
@@ -23,9 +24,12 @@ export function plannedIterations(quality, views, measured) {
   return Math.floor(whole / step) * step;
 }
 
-// Seconds for the remaining steps, from the seconds of a step now. count, planned: Gaussians now and in the end.
-export function secondsLeft({ steps, perStep, count, planned }) {
-  const mean = Math.max(count, (count + planned) / 2);
+// Seconds for the remaining steps, from the seconds of a step now. count, planned: Gaussians now and at `GROWN`, until which
+// their number grows evenly.
+export function secondsLeft({ steps, iterations, perStep, count, planned }) {
+  const growing = Math.min(steps, Math.max(0, GROWN * iterations - (iterations - steps)));
+  const full = growing ? Math.max(count, planned) : count;
+  const mean = steps ? (growing * (count + full) * 0.5 + (steps - growing) * full) / steps : count;
   return steps * perStep * (1 - GROWING + (GROWING * mean) / Math.max(1, count));
 }
 

@@ -63,7 +63,8 @@ class Training {
 
   get left() {
     const { count, planned } = this.trainer;
-    return secondsLeft({ steps: this.steps, perStep: this.perStep, count, planned });
+    const { iterations } = this.given.settings;
+    return secondsLeft({ steps: this.steps, iterations, perStep: this.perStep, count, planned });
   }
 
   get facts() {
