@@ -215,6 +215,17 @@ def test_what_is_no_capture_is_refused_with_what_to_do(written, tmp_path):
     assert "drop a folder or zip file" in refused(tmp_path / "empty")
 
 
+def test_rotations_written_with_few_digits_become_the_nearest_ones(written):
+    """Python's come from a singular value decomposition, whose errors are some 1e-16."""
+    folder = written("transforms")
+    path = folder / "transforms.json"
+    contents = json.loads(path.read_text())
+    for frame in contents["frames"]:
+        frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
+    path.write_text(json.dumps(contents))
+    check_agrees(read(folder), folder)
+
+
 def test_an_impossible_pose_is_left_out(written):
     folder = written("transforms")
     path = folder / "transforms.json"

@@ -133,7 +133,21 @@ function usable(frames, notes) {
   const bad = frames.find((frame) => !good.includes(frame));
   if (bad)
     notes.push(`${frames.length - good.length} of ${frames.length} photos have an impossible pose, first ${bad.name}.`);
-  return good;
+  return good.map((frame) => ({ ...frame, R: nearestRotation(frame.R) }));
+}
+
+// The rotation nearest to a matrix that was written with few digits, in the least-squares sense: the mean of the matrix and
+// its inverse transpose, repeated, keeps the singular vectors and brings the singular values to 1, twice the digits each time.
+function nearestRotation(R) {
+  let nearest = R;
+  for (let step = 0; step < 6; ++step) {
+    const [a, b, c, d, e, f, g, h, i] = nearest;
+    const cofactors = [e * i - f * h, f * g - d * i, d * h - e * g, c * h - b * i, a * i - c * g, b * g - a * h];
+    cofactors.push(b * f - c * e, c * d - a * f, a * e - b * d);
+    const det = a * cofactors[0] + b * cofactors[1] + c * cofactors[2];
+    nearest = nearest.map((value, k) => (value + cofactors[k] / det) / 2);
+  }
+  return nearest;
 }
 
 function isRotation(R) {
