@@ -6,7 +6,7 @@ import argparse
 
 from gsplat_edu.options.values import add_address
 
-EXAMPLE = "example: gsplat-edu web"
+EXAMPLE = "example: gsplat-edu web --port 9000"
 
 PORT = 8070
 """Default port: another one than those of a single page and of the studio."""

@@ -131,59 +131,77 @@ export function asPinhole(stored, lens, longest) {
 // Averages an image over the pixels of a smaller one. pixels: H W `channels` bytes; returns h w 3 bytes.
 export function reduced(pixels, [W, H], channels, [w, h]) {
   const across = sharesOf(W, w);
-  const rows = new Float64Array(w * 3 * H);
-  for (let y = 0; y < H; ++y) {
-    for (let x = 0; x < w; ++x) {
-      for (const [from, share] of across[x]) {
-        for (let c = 0; c < 3; ++c) rows[(y * w + x) * 3 + c] += share * pixels[(y * W + from) * channels + c];
+  const down = sharesOf(H, h);
+  const row = new Float64Array(3 * W);
+  const out = new Uint8Array(w * h * 3);
+  for (let y = 0; y < h; ++y) {
+    row.fill(0);
+    for (let k = down.starts[y]; k < down.starts[y + 1]; ++k) {
+      const [from, share] = [down.places[k] * W, down.shares[k]];
+      for (let x = 0; x < W; ++x) {
+        for (let c = 0; c < 3; ++c) row[3 * x + c] += share * pixels[(from + x) * channels + c];
       }
     }
-  }
-  const out = new Uint8Array(w * h * 3);
-  const sums = new Float64Array(w * 3);
-  sharesOf(H, h).forEach((shares, y) => {
-    sums.fill(0);
-    for (const [from, share] of shares) {
-      for (let i = 0; i < w * 3; ++i) sums[i] += share * rows[from * w * 3 + i];
+    for (let x = 0; x < w; ++x) {
+      let [red, green, blue] = [0, 0, 0];
+      for (let k = across.starts[x]; k < across.starts[x + 1]; ++k) {
+        const [at, share] = [3 * across.places[k], across.shares[k]];
+        red += share * row[at];
+        green += share * row[at + 1];
+        blue += share * row[at + 2];
+      }
+      out.set([Math.round(red), Math.round(green), Math.round(blue)], 3 * (y * w + x));
     }
-    for (let i = 0; i < w * 3; ++i) out[y * w * 3 + i] = Math.round(sums[i]);
-  });
+  }
   return out;
 }
 
-// For each of n pixels along a side, which of the N original ones it covers and their shares: [[index, share], ...].
+// What each of n pixels along a side covers of the N original ones: pixel i has the `places` and their `shares` from starts[i]
+// to starts[i + 1].
 function sharesOf(N, n) {
   const step = N / n;
-  return Array.from({ length: n }, (_, i) => {
+  const [starts, places, shares] = [[0], [], []];
+  for (let i = 0; i < n; ++i) {
     const [from, to] = [i * step, Math.min(N, (i + 1) * step)];
-    const shares = [];
     for (let k = Math.floor(from); k < to; ++k) {
       const share = (Math.min(to, k + 1) - Math.max(from, k)) / step;
-      if (share > 0) shares.push([k, share]);
+      if (share <= 0) continue;
+      places.push(k);
+      shares.push(share);
     }
-    return shares;
-  });
+    starts.push(places.length);
+  }
+  return { starts, places, shares };
 }
 
+// Where the pixels of a pinhole's image lie in the photo of a lens: columns and rows, px, within the photo.
+function placesOf(lens, { W, H, fx, fy, cx, cy }) {
+  const [us, vs] = [new Float32Array(W * H), new Float32Array(W * H)];
+  for (let i = 0; i < W * H; ++i) {
+    const [a, b] = distorted(lens.coefficients, ((i % W) - cx) / fx, (Math.floor(i / W) - cy) / fy);
+    us[i] = Math.min(lens.W - 1, Math.max(0, lens.fx * a + lens.cx));
+    vs[i] = Math.min(lens.H - 1, Math.max(0, lens.fy * b + lens.cy));
+  }
+  return [us, vs];
+}
+
+let known = { key: "", places: null }; // of the last lens: most captures have one
+
 // A photo as its pinhole sees it, by bilinear interpolation. pixels: H W 3 bytes of the lens's size.
-export function undistorted(pixels, lens, pinhole) {
-  const { W, H, fx, fy, cx, cy } = pinhole;
-  const out = new Uint8Array(W * H * 3);
-  const [w, h] = [lens.W - 1, lens.H - 1];
-  for (let y = 0; y < H; ++y) {
-    for (let x = 0; x < W; ++x) {
-      const [a, b] = distorted(lens.coefficients, (x - cx) / fx, (y - cy) / fy);
-      const u = Math.min(w, Math.max(0, lens.fx * a + lens.cx));
-      const v = Math.min(h, Math.max(0, lens.fy * b + lens.cy));
-      const [left, top] = [Math.floor(u), Math.floor(v)];
-      const [s, t] = [u - left, v - top];
-      const [above, below] = [top * lens.W, Math.min(top + 1, h) * lens.W];
-      const right = Math.min(left + 1, w);
-      for (let c = 0; c < 3; ++c) {
-        const upper = (1 - s) * pixels[3 * (above + left) + c] + s * pixels[3 * (above + right) + c];
-        const lower = (1 - s) * pixels[3 * (below + left) + c] + s * pixels[3 * (below + right) + c];
-        out[3 * (y * W + x) + c] = Math.round((1 - t) * upper + t * lower);
-      }
+function undistorted(pixels, lens, pinhole) {
+  const key = JSON.stringify([lens, pinhole]);
+  if (known.key !== key) known = { key, places: placesOf(lens, pinhole) };
+  const [us, vs] = known.places;
+  const out = new Uint8Array(3 * us.length);
+  for (let i = 0; i < us.length; ++i) {
+    const [left, top] = [Math.floor(us[i]), Math.floor(vs[i])];
+    const [s, t] = [us[i] - left, vs[i] - top];
+    const at = 3 * (top * lens.W + left);
+    const [right, down] = [left + 1 < lens.W ? 3 : 0, top + 1 < lens.H ? 3 * lens.W : 0];
+    for (let c = 0; c < 3; ++c) {
+      const upper = (1 - s) * pixels[at + c] + s * pixels[at + right + c];
+      const lower = (1 - s) * pixels[at + down + c] + s * pixels[at + down + right + c];
+      out[3 * i + c] = Math.round((1 - t) * upper + t * lower);
     }
   }
   return out;
