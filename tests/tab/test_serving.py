@@ -7,7 +7,7 @@ import urllib.request
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.tab.serving import EXAMPLE, MODULE, PACKAGE, ROOMS, TabServer, page_files
+from gsplat_edu.tab.serving import EXAMPLE, MODULES, PACKAGE, ROOMS, TabServer, page_files
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ TYPES = {
     "/": "text/html; charset=utf-8",
     "/tab/web/worker.js": "text/javascript; charset=utf-8",
     "/tab/web/style.css": "text/css; charset=utf-8",
-    f"/tab/web/{MODULE}": "application/wasm",
+    **{f"/tab/web/{name}": "application/wasm" for name in MODULES},
     "/base/web/icons.svg": "image/svg+xml",
     EXAMPLE: "application/octet-stream",
 }
@@ -64,12 +64,11 @@ def test_the_page_names_the_shared_modules_at_once():
     assert len(shared) == 3 and all(f'<link rel="modulepreload" href="/{name}">' in page for name in shared)
 
 
-def test_without_the_module_one_line_says_how_to_build_it(tmp_path):
+@pytest.mark.parametrize("missing", MODULES)
+def test_without_a_module_one_line_says_how_to_build_it(node, tmp_path, missing):
     for room in ROOMS:
         shutil.copytree(
-            PACKAGE / room / "web", tmp_path / room / "web", ignore=shutil.ignore_patterns("*.wasm")
+            PACKAGE / room / "web", tmp_path / room / "web", ignore=shutil.ignore_patterns(missing)
         )
-    with pytest.raises(
-        ArgumentError, match=r"gsplat_edu\.wasm: is not built; run python tools/build_wasm\.py"
-    ):
+    with pytest.raises(ArgumentError, match=f"{missing}: is not built; run python tools/build_wasm.py"):
         page_files(tmp_path)

@@ -14,8 +14,8 @@ from gsplat_edu.server.page_server import TYPES, PageServer
 PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
 
-MODULE = "gsplat_edu.wasm"
-"""The compiled kernels and trainer, a file beside the page's scripts."""
+MODULES = ("gsplat_edu.wasm", "gsplat_edu_threads.wasm")
+"""The compiled kernels and trainer, for one thread and for several: files beside the page's scripts."""
 
 ROOMS = ("base", "tab", "viewer")
 """Rooms of the package whose folder `web` the page loads files from, at the path that they have in the package."""
@@ -49,7 +49,7 @@ class TabServer(PageServer):
         port: Port; 0 picks a free one.
 
     Raises:
-        ArgumentError: the module is not built, or as for `PageServer`.
+        ArgumentError: a module is not built, or as for `PageServer`.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
@@ -80,13 +80,13 @@ def page_files(package: Path = PACKAGE) -> dict[str, Path]:
         package: The folder of the package.
 
     Raises:
-        ArgumentError: the module is not built.
+        ArgumentError: a module is not built.
     """
-    module = package / "tab" / "web" / MODULE
-    if not module.is_file():
-        raise ArgumentError(
-            f"{module}: is not built; run python tools/build_wasm.py in a clone of the repository"
-        )
+    for module in (package / "tab" / "web" / name for name in MODULES):
+        if not module.is_file():
+            raise ArgumentError(
+                f"{module}: is not built; run python tools/build_wasm.py in a clone of the repository"
+            )
     found = {EXAMPLE: package / "studio" / "example.zip"}
     for room in ROOMS:
         files = (package / room / "web").iterdir()

@@ -323,6 +323,7 @@ function details() {
   const { facts, progress, verdict, forecast } = state;
   const rows = [
     ["Photos", `${facts.training} for training, ${facts.heldOut} held out, ${facts.W} x ${facts.H} px`],
+    ["Threads", facts.threads],
     ["Start points", facts.measured ? "of the capture" : "random, where photos overlap"],
     progress && ["Iteration", `${whole(progress.iteration)} of ${whole(facts.iterations)}`],
     progress && [

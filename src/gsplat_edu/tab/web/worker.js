@@ -2,7 +2,7 @@
 // {do, ...}, a method of `acts`; each one from it is {say, ...}.
 
 import { readCapture } from "./capture.js";
-import { loadModule, plannedGaussians, Trainer } from "./engine.js";
+import { EngineError, loadModule, plannedGaussians, Trainer } from "./engine.js";
 import { bytesNeeded, plannedIterations, secondsLeft } from "./length.js";
 import { decodedView } from "./photos.js";
 import { plyOf } from "./ply.js";
@@ -13,6 +13,9 @@ import { judged } from "./verdict.js";
 import { isZip, unzipped } from "./zip.js";
 
 const LIMIT = 2 ** 31; // bytes of the module's memory
+const MOST_THREADS = 8;
+const THREADS = crossOriginIsolated ? Math.min(navigator.hardwareConcurrency || 1, MOST_THREADS) : 1; // else memory is not shared
+const FILE = THREADS > 1 ? "./gsplat_edu_threads.wasm" : "./gsplat_edu.wasm";
 const TRIAL = 20; // steps before the forecast
 const CHUNK = 0.2; // seconds of steps between two looks at the messages
 const MOST_STEPS = 50;
@@ -77,6 +80,7 @@ class Training {
       quality,
       longest,
       measured,
+      threads: THREADS,
       ...counts,
       W: camera.W,
       H: camera.H,
@@ -197,8 +201,21 @@ function release() {
   training = null;
 }
 
-const module = loadModule(new URL("./gsplat_edu.wasm", import.meta.url), { threads: 1, limit: LIMIT });
-module.catch(() => {}); // `begin` says so
+function load() {
+  const loading = loadModule(new URL(FILE, import.meta.url), { threads: THREADS, limit: LIMIT });
+  loading.catch(() => {}); // `begin` says so
+  return loading;
+}
+
+let module = load();
+
+// Takes a new module in place of one that has refused something, whose memory is in no defined state.
+async function replaceModule() {
+  training = null;
+  const old = await module.catch(() => null);
+  old?.close();
+  module = load();
+}
 
 // Makes the trainer, tries some steps and says how long all of them take.
 async function begin(given, state = null) {
@@ -313,6 +330,7 @@ addEventListener("message", async ({ data }) => {
     if (error instanceof Replaced) return;
     const isKnown = error instanceof CaptureError;
     if (!isKnown) console.error(error);
-    say({ say: "error", did: data.do, text: isKnown ? error.message : `This did not work: ${error.message}` });
+    if (error instanceof EngineError || error instanceof WebAssembly.RuntimeError) await replaceModule();
+    say({ say: "error", did: data.do, text: isKnown ? error.message : `This did not work: ${error.message}.` });
   }
 });
