@@ -1,5 +1,6 @@
 """The documents' examples run, and the documents name all commands, constants, targets and benchmarks."""
 
+import ast
 import re
 import shlex
 import tomllib
@@ -7,10 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from gsplat_edu import load_backend
 from gsplat_edu.base import constants
 from gsplat_edu.cli.main import build_parser
+from gsplat_edu.data.synthetic import sphere_capture
 from gsplat_edu.scene import projection, projection_formulas, shutter, sight
+from gsplat_edu.train import Start, Views, training
+from gsplat_edu.train.course import EXTENT, course_config
+from gsplat_edu.train.events import StepEvent
+from gsplat_edu.train.initialize import random_ball
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "gsplat_edu"
@@ -30,6 +38,46 @@ EXAMPLES = {
 def test_the_examples_of_the_documents_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(EXAMPLES[name], name, "exec"), {})
+
+
+def the_log():
+    """Return the source of `logging_to` in PYTHON.md, and the function."""
+    (example,) = [text for text in EXAMPLES.values() if "def logging_to(" in text]
+    (function,) = [each for each in ast.parse(example).body if isinstance(each, ast.FunctionDef)]
+    names = {"StepEvent": StepEvent}
+    source = ast.get_source_segment(example, function)
+    exec(compile(source, "PYTHON.md", "exec"), names)
+    return source, names["logging_to"]
+
+
+class Recorder:
+    """Takes what the `SummaryWriter` of torch.utils.tensorboard takes, and keeps it."""
+
+    def __init__(self):
+        self.rows = {}
+
+    def add_scalar(self, tag, scalar_value, global_step=None):
+        assert isinstance(tag, str) and isinstance(scalar_value, (int, float)), "what TensorBoard can write"
+        self.rows.setdefault(tag, []).append((global_step, scalar_value))
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_ten_lines_log_every_loss_and_count_of_a_training(every):
+    source, logging_to = the_log()
+    assert len([line for line in source.splitlines() if line.strip()]) <= 10
+    capture, writer = sphere_capture(size=16), Recorder()
+    start = Start(random_ball(40, torch.Generator().manual_seed(0)), extent=EXTENT)
+    result = training(
+        course_config(iterations=9).changed(strategy="none"),
+        Views(capture.train),
+        load_backend("cpu"),
+        start,
+        callbacks=[logging_to(writer, every)],
+    ).run()
+    steps = range(0, 9, every)
+    assert set(writer.rows) == {"loss/photo", "gaussians"}
+    assert writer.rows["loss/photo"] == [(step, result.losses[step]) for step in steps]
+    assert writer.rows["gaussians"] == [(step, 40) for step in steps]
 
 
 def test_there_are_examples():

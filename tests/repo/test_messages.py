@@ -27,6 +27,27 @@ those that declare options."""
 OTHERS = {"usdcat --flatten"}
 """Commands of other programs."""
 
+LIBRARY = ("scene", "render", "train", "data", "io", "compat", "ops")
+"""Rooms that a user of the library reaches. None of their texts may name an option, because errors use them."""
+
+NO_ERRORS = {
+    "train/config.py": {
+        "refine the cameras of the whole first, with --resolution": "what `train --blocks` refuses with",
+        "Values of the maps of --depth.": "a setting's meaning in `train --help` and RECIPE.md",
+        "World units for a unit of the maps of --depth;": "a setting's meaning in `train --help` and RECIPE.md",
+    },
+    "train/setting.py": {"--set ": "`Setting.written`, which the command line names a setting with"},
+    "data/loading_notes.py": {
+        "train --lens native renders it": "a note that the command prints, of photos that were loaded",
+        "raise --image-memory, or load smaller photos with --resolution": "a note that the command prints",
+    },
+    "data/notes.py": {
+        "published scores of Blender scenes are on white, as with --white-background": "a note that the command prints",
+        "--set region=none uses all of them": "a note that the command prints",
+    },
+}
+"""Texts of these rooms that name an option and are no errors, by file, each with the reason."""
+
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 
 
@@ -45,6 +66,46 @@ def advice(tree):
                 text = text.replace(other, "")
             if OPTION.search(text):
                 yield node.lineno, text
+
+
+def texts(tree):
+    """Return line and text of the strings that name an option, except docstrings and strings that nothing uses."""
+    unused = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in unused:
+            text = node.value
+            for other in OTHERS:
+                text = text.replace(other, "")
+            if OPTION.search(text):
+                yield node.lineno, text
+
+
+def test_no_text_behind_the_library_names_an_option():
+    """An error's words can come from a variable, a table or another function: `advice` sees only what is raised."""
+    found, used = [], set()
+    for path in sorted(path for room in LIBRARY for path in (SOURCE / room).rglob("*.py")):
+        name = path.relative_to(SOURCE).as_posix()
+        for line, text in texts(ast.parse(path.read_text(encoding="utf-8"))):
+            known = [words for words in NO_ERRORS.get(name, ()) if words in text]
+            used |= {(name, words) for words in known}
+            if not known:
+                found.append(f"{name}:{line}: {text}")
+    assert found == []
+    listed = {(name, words) for name, reasons in NO_ERRORS.items() for words in reasons}
+    assert listed - used == set(), "what is gone is not listed"
+
+
+@pytest.mark.parametrize(
+    ("code", "count"),
+    [
+        ("ADVICE = {'a': 'give --voxel'}\nraise ValueError(ADVICE['a'])", 1),
+        ("def words(x):\n    'See --voxel.'\n    return f'{x}: less of ' '--voxel'", 1),
+        ("size = 'use `voxel`'", 0),
+        ("'as --voxel does'", 0),
+    ],
+)
+def test_texts_are_found(code, count):
+    assert len(list(texts(ast.parse(code)))) == count
 
 
 def of_room(room):

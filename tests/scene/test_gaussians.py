@@ -86,6 +86,30 @@ def test_other_kinds_and_shapes_name_the_argument():
         Gaussians.from_activated(**(given | {"colors": torch.zeros(5, 5, 3).double()}))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"means": [[0.0, 0.0, 0.0]]}, "means: is of type list, but has to be a tensor"),
+        ({"opacities": 0.5}, "opacities: is of type float, but has to be a tensor"),
+        ({"colors": None}, "colors: is of type NoneType, but has to be a tensor"),
+        ({"scales": torch.ones(5, 3).long()}, "scales: is torch.int64, but has to be a float tensor"),
+        ({"means": torch.zeros(5, 3).half()}, "means: is float16, which is too coarse"),
+        ({"means": torch.zeros(5, 2).double()}, "means: expected shape (N, 3), got (5, 2)"),
+        ({"quats": torch.ones(4, 4).double()}, "quats: expected shape (N=5, 4), got (4, 4)"),
+        ({"opacities": torch.full((5, 1), 0.5).double()}, "opacities: expected shape (N=5,), got (5, 1)"),
+        ({"colors": torch.zeros(5).double()}, "colors: expected shape (N=5, K, 3), got (5,)"),
+        ({"quats": torch.zeros(5, 4).double()}, "quats[0]: has zero length"),
+        ({"scales": -torch.ones(5, 3).double()}, "scales[0, 0]: is -1, but has to be above 0"),
+    ],
+    ids=lambda each: next(iter(each)) if isinstance(each, dict) else "",
+)
+@pytest.mark.usefixtures("as_shipped")
+def test_a_wrong_argument_is_one_line_that_starts_with_its_name(wrong, said):
+    with pytest.raises(ArgumentError) as caught:
+        Gaussians.from_activated(**(activated() | wrong))
+    assert str(caught.value).startswith(said) and "\n" not in str(caught.value)
+
+
 def ball(count=4):
     return random_ball(count, torch.Generator().manual_seed(2))
 

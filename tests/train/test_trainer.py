@@ -74,6 +74,32 @@ def test_callbacks_get_every_step_and_densification_in_order(views):
     assert result.seconds > 0
 
 
+def test_stop_is_asked_after_every_step_and_a_stopped_run_goes_on_with_the_same_bits(views):
+    whole, stopped, asked = trainer(views), trainer(views), []
+
+    def fifth():
+        asked.append(stopped.iteration)
+        return stopped.iteration == 5
+
+    expected, first = whole.run().losses, stopped.run(stop=fifth)
+    assert asked == [1, 2, 3, 4, 5] and stopped.iteration == 5
+    assert first.losses == expected[:5] and len(first.counts) == 5
+    rest = stopped.run(stop=lambda: False)
+    assert stopped.iteration == SHORT.iterations and rest.losses == expected[5:]
+    for name, tensor in whole.gaussians.tensors().items():
+        assert torch.equal(tensor, stopped.gaussians.tensors()[name]), name
+    assert stopped.run().losses == [], "the budget is spent"
+
+
+def test_what_callbacks_saw_decides_when_a_run_ends(views):
+    """The stop sees the loss of the step that has just been taken."""
+    seen = []
+    run = trainer(views, [lambda _, event: seen.append(event) if isinstance(event, StepEvent) else None])
+    losses = run.run(stop=lambda: seen[-1].iteration >= 2 and seen[-1].loss < seen[0].loss).losses
+    assert 3 <= len(losses) < SHORT.iterations and losses[-1] < losses[0]
+    assert all(loss >= losses[0] for loss in losses[2:-1])
+
+
 def test_the_start_is_not_modified(views):
     start = random_ball(20, torch.Generator().manual_seed(0))
     before = start.map(torch.clone)

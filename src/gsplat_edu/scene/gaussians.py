@@ -371,7 +371,8 @@ def cov3d_t(log_scales: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Fl
 def _check_kind(name: str, value: object, means: object, wanted: str = "means are") -> None:
     """Check that a value is a float32 or float64 tensor of the dtype and device of other Gaussians' means."""
     if not (isinstance(value, Tensor) and value.is_floating_point()):
-        raise ArgumentError(f"{name}: has to be a float tensor, got {type(value).__name__}")
+        kind = value.dtype if isinstance(value, Tensor) else f"of type {type(value).__name__}"
+        raise ArgumentError(f"{name}: is {kind}, but has to be a float tensor")
     refuse_halves(name, value)
     if isinstance(means, Tensor) and (value.dtype, value.device) != (means.dtype, means.device):
         kind = f"{means.dtype} on {means.device}"
