@@ -34,6 +34,7 @@ NEEDED = {
     "mesh": "a b.glb",
     "view": "a",
     "studio": "",
+    "web": "",
     "doctor": "a",
     "leave-out": "a",
     "mask": "a b",

@@ -6,7 +6,7 @@ const events = new EventTarget();
 globalThis.addEventListener = events.addEventListener.bind(events);
 
 const { leftOf, startJob, waitsFor } = await import("../../src/gsplat_edu/studio/web/jobs.js");
-const { bytes } = await import("../../src/gsplat_edu/studio/web/dom.js");
+const { bytes } = await import("../../src/gsplat_edu/viewer/web/words.js");
 const { dayOf, namedByDay } = await import("../../src/gsplat_edu/studio/web/intake.js");
 const { Store } = await import("../../src/gsplat_edu/studio/web/store.js");
 

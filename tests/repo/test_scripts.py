@@ -47,12 +47,14 @@ ELSEWHERE = {
     "build_slides.py": "tests/repo/test_book.py",
     "build_notebooks.py": "tests/repo/test_notebooks.py",
     "build_site.py": "tests/repo/test_site.py",
+    "build_wasm.py": "tools/set_up.sh",
     "build_wheels.py": "tests/repo/test_wheels.py",
     "chapter_figures.py": "tests/repo/test_notebooks.py",
     "check_objects.py": "tools/sanitize.sh",
     "landing_scene.py": "course/build_site.py",
     "figure_data.py": "tests/repo/test_figures.py",
     "figure_photos.py": "tests/repo/test_figures.py",
+    "generate_recipe.py": "tests/tab/test_engine.py",
     "list_licences.py": "tests/repo/test_licences.py",
     "house_limits.py": "tests/repo/test_house_limits.py",
     "neon.sh": "Makefile",
@@ -60,6 +62,7 @@ ELSEWHERE = {
     "stress.sh": "Makefile",
     "set_up.sh": "Makefile",
     "site_figures.py": "tests/repo/test_figures.py",
+    "wasm_host.py": "tests/tab/conftest.py",
 }
 """By the name of a tool or of a script of the course, the file that runs it."""
 

@@ -265,9 +265,9 @@ def test_the_page_names_all_its_modules_at_once(page):
     text = page.get("/").text
     asked = set(re.findall(r'(?:rel="modulepreload" href|script type="module" src)="(/[\w/]+\.js)"', text))
     modules = (files("gsplat_edu.studio") / "web").iterdir()
-    assert asked == {"/viewer/web/patch.js", "/web/questions.js"} | {
-        f"/web/{path.name}" for path in modules if path.suffix == ".js"
-    }
+    shared = {f"/viewer/web/{name}.js" for name in ("dropped", "patch", "words")}
+    own = {f"/web/{path.name}" for path in modules if path.suffix == ".js"}
+    assert asked == {"/web/questions.js"} | shared | own
 
 
 def promised(page, wish, kind="photos"):

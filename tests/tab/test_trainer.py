@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from gsplat_edu.data.procedural import procedural_capture
 from gsplat_edu.data.synthetic import sphere_capture
@@ -17,8 +18,6 @@ from wasm_host import EngineError, Host, camera_of, options_of, view_of
 
 def gaussians_of(found):
     """Gaussians from what the trainer returns."""
-    import torch
-
     count = found.pop("count")
     shapes = {"sh0": (count, 1, 3), "sh_rest": (count, -1, 3), "logit_opacities": (count,)}
     return Gaussians(
@@ -58,6 +57,30 @@ def test_the_first_steps_are_those_of_the_package(host, egg):
     opacity = 0.002 * 0.1  # which the package adds to the loss that it reports
     assert losses[0] == pytest.approx(result.losses[0], abs=opacity)
     assert losses == pytest.approx(result.losses, rel=1e-3, abs=2 * opacity)
+
+
+def test_density_control_is_that_of_the_package(host, egg):
+    """The rules stand twice, because the package's work on tensors of any device.
+
+    After the first splits there are as many Gaussians, and nearly each has one at its place, as large and as opaque.
+    Where the scores of two differ by less than their rounding, another one is split.
+    """
+    views, _, points, colors = egg
+    trainer = training(
+        recipe(400, strategy="fast", max_gaussians=2_000),
+        Capture(views[:1], points, colors),
+        load_backend("cpu"),
+    )
+    trainer.run(lambda: trainer.iteration >= 41)  # splits at 20 and 40
+    host.ask("train", **options_of(views[:1], points, colors, iterations=400, maxGaussians=2_000))
+    host.ask("step", count=41)
+    ours, theirs = trainer.gaussians, gaussians_of(host.ask("gaussians"))
+    assert len(ours) == len(theirs) > len(points) + 50
+    distances = torch.cdist(ours.means.double(), theirs.means.double())
+    nearest, at = distances.min(dim=1)
+    alike = (nearest < 2e-3) & ((ours.log_scales - theirs.log_scales[at]).abs().amax(dim=1) < 2e-2)
+    alike &= (ours.logit_opacities - theirs.logit_opacities[at]).abs() < 5e-2
+    assert alike.double().mean() > 0.97
 
 
 def test_a_training_reaches_what_the_package_reaches(host, egg):

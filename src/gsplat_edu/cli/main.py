@@ -35,6 +35,7 @@ COMMANDS = {
     "mesh": "make a triangle mesh of a scene's surfaces, and say how far it can be trusted",
     "view": "show a scene or a run in the browser",
     "studio": "take photos to a finished scene on one page in the browser",
+    "web": "train a scene inside a browser tab, from photos with camera poses that stay on the computer",
     "doctor": "find problems of a capture before training, or of a run after it, and suggest remedies",
     "leave-out": "take photos out of use in a capture, or bring them back; their files stay",
     "mask": "exclude parts of a photo by its mask, or restore the mask as it was",

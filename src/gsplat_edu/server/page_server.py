@@ -22,7 +22,15 @@ from gsplat_edu.server.patience import Patience
 from gsplat_edu.server.refusal import RefusedError
 from gsplat_edu.server.serving import PATIENCE, Server
 
-TYPES = {".json": "application/json", ".webp": "image/webp"}
+TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".svg": "image/svg+xml",
+    ".wasm": "application/wasm",
+    ".webp": "image/webp",
+}
 """Content types of files by suffix."""
 
 

@@ -1,8 +1,9 @@
 // Elements and the words on them. Text always becomes text nodes, so that a name like <b> is shown as it is.
 
 import { h, patch, want } from "../../viewer/web/patch.js";
+import { bytes, count, duration, whole } from "../../viewer/web/words.js";
 
-export { h, patch, want };
+export { bytes, count, duration, h, patch, want, whole };
 
 export const button = (text, onclick, more = {}) => h("button", { type: "button", onclick, ...more }, text);
 
@@ -31,23 +32,6 @@ export function toned(state, text) {
 export function put(element, text) {
   patch(element, text);
   element.hidden = !text;
-}
-
-export const count = (number, one, many = `${one}s`) => `${whole(number)} ${number === 1 ? one : many}`;
-
-export const whole = (number) => Math.round(number).toLocaleString("en");
-
-export function bytes(number) {
-  const units = ["B", "kB", "MB", "GB", "TB"];
-  let [value, unit] = [number, 0];
-  while (Math.round(value) >= 1000 && unit < units.length - 1) [value, unit] = [value / 1000, unit + 1];
-  return `${unit && Math.round(value) < 100 ? value.toPrecision(2) : Math.round(value)} ${units[unit]}`;
-}
-
-export function duration(seconds) {
-  if (seconds < 60) return `${Math.max(1, Math.round(seconds))} s`;
-  const minutes = Math.round(seconds / 60);
-  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 
 // How long ago a time (s since 1970) was, in words; a date beyond a week.

@@ -1,5 +1,6 @@
 // Takes in photos, folders, zip files, videos and scenes: dropped, chosen, or named by their path.
 
+import { filesOf } from "../../viewer/web/dropped.js";
 import { at, post, remove, upload } from "./api.js";
 import { announce, attempt, bytes, button, count, dateOf, errorLine, h, heading } from "./dom.js";
 
@@ -9,28 +10,6 @@ const VIDEOS = /\.(mp4|mov|m4v|avi|mkv|webm|mts|m2ts|mpg|mpeg|3gp|wmv)$/i; // a 
 const IGNORED = /(?:^|\/)(?:\.[^/]*|Thumbs\.db|desktop\.ini)$/i;
 const HEAD = 1 << 18; // bytes at the start of a photo in which its EXIF data lie
 const TAKEN = /((?:19|20)\d\d):(0[1-9]|1[0-2]):(0[1-9]|[12]\d|3[01]) \d\d:\d\d:\d\d\0/g; // a date of EXIF, in every format
-
-// All files below dropped entries, as {file, path}.
-async function filesOf(transfer) {
-  const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
-  if (!entries.length) return [...transfer.files].map((file) => ({ file, path: file.name }));
-  const found = [];
-  const walk = async (entry, above) => {
-    const path = above + entry.name;
-    if (entry.isFile) {
-      found.push({ file: await new Promise((resolve, reject) => entry.file(resolve, reject)), path });
-      return;
-    }
-    const reader = entry.createReader();
-    for (;;) {
-      const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
-      if (!some.length) return; // a browser lists a hundred at a time
-      for (const one of some) await walk(one, `${path}/`);
-    }
-  };
-  for (const entry of entries) await walk(entry, "");
-  return found;
-}
 
 const isPhotoOrVideo = ({ file, path }) => /^(?:image|video)\//.test(file.type) || VIDEOS.test(path);
 
