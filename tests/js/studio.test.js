@@ -6,6 +6,7 @@ const events = new EventTarget();
 globalThis.addEventListener = events.addEventListener.bind(events);
 
 const { leftOf, startJob, waitsFor } = await import("../../src/gsplat_edu/studio/web/jobs.js");
+const { bytes } = await import("../../src/gsplat_edu/viewer/web/words.js");
 const { dayOf, namedByDay } = await import("../../src/gsplat_edu/studio/web/intake.js");
 const { Store } = await import("../../src/gsplat_edu/studio/web/store.js");
 
@@ -37,6 +38,15 @@ function secondsIn(text) {
   const [, hours, number, unit] = text.match(/(?:(\d+) h )?(\d+) (s|min) left/);
   return (60 * Number(hours ?? 0) + Number(number)) * (unit === "s" ? 1 : 60);
 }
+
+test("a size has two digits or a whole number, and never a thousand of a unit", () => {
+  const said = [0, 999, 1000, 9949, 99_400, 99_500, 99_960, 112_000, 999_499, 999_500, 1e6, 65.4e9, 5e15].map(bytes);
+  const [small, large] = [
+    ["0 B", "999 B", "1.0 kB", "9.9 kB", "99 kB"],
+    ["1.0 MB", "1.0 MB", "65 GB", "5000 TB"],
+  ];
+  assert.deepEqual(said, [...small, "100 kB", "100 kB", "112 kB", "999 kB", ...large]);
+});
 
 test("the time left never rises in a stage", () => {
   // densification makes iterations slower than the pace of the first ones; one forecast is missing

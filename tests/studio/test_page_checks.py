@@ -75,6 +75,11 @@ def test_a_gap_in_the_order_of_the_photos_is_said(visitor, library):
     assert finding.startswith(
         "1 place where a photo shares too little with the next one, first photo_13.jpg with photo_14.jpg."
     )
+    assert "\n\nLeave it if other photos show what both show; otherwise take two or three photos" in finding
+    weights = (
+        "[...document.querySelectorAll('.findings li p')].map((one) => getComputedStyle(one).fontWeight)"
+    )
+    assert tab.evaluate(weights)[:2] == ["600", "400"], "what was found stands out from the advice"
 
 
 def test_the_usual_number_is_that_of_the_tour(request):

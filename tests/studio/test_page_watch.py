@@ -11,7 +11,7 @@ from gsplat_edu.edits.document import empty_document
 from gsplat_edu.edits.identity import identity_of
 from gsplat_edu.runs.source import open_source
 from processes import Program
-from studio.pages import COMMAND, DROP, encoded, frame_of, go, held_back, png
+from studio.pages import COMMAND, DROP, encoded, frame_of, go, held_back, png, waiting
 from waiting import awaited, resize, until_in
 
 
@@ -85,6 +85,16 @@ def test_the_cover_is_shown_until_the_scene_is_drawn(visitor, runs):
     assert person.shift() - before < 0.01 and tab.locator(".scene").bounding_box() == stage
 
 
+def test_a_training_without_a_folder_shows_a_photo_of_its_capture(visitor, library, runs):
+    studio = library[0]
+    with waiting(studio):
+        studio.start({"command": "train", "subject": "captures/egg", "to": "later"})
+        assert not (runs / "later").exists()
+        tab = go(visitor().tab, "runs/later")
+        tab.locator(".scene .cover[src*='/captures/egg/thumbs/']").wait_for()
+        tab.locator(".head").get_by_role("link", name="egg", exact=True).wait_for()
+
+
 @pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
 def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     person = visitor()
@@ -97,6 +107,15 @@ def test_nothing_lies_on_the_photo_beside_the_render(visitor, runs, size):
     assert not frame.locator("#bar").is_visible(), "the bar lies on the photo"
     tab.get_by_label("View", exact=True).select_option(index=0)
     assert frame.locator("#bar").is_visible()
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1440, 900)])
+def test_a_title_that_is_the_day_of_the_photos_is_seen_whole(visitor, runs, size):
+    tab = go(visitor().tab, "runs/egg/share")
+    resize(tab, size[0], size[1])
+    title = tab.get_by_label("Title and name of the file")
+    title.fill("Photos of 30 September 2026")
+    assert title.evaluate("(one) => one.scrollWidth <= one.clientWidth")
 
 
 PHOTOS_SHOWN = """() => {

@@ -4,9 +4,9 @@ import base64
 import hashlib
 
 import pytest
-from gsplat_edu.tab.serving import TabServer
 
 from gsplat_edu.data.procedural import procedural_capture
+from gsplat_edu.tab.serving import TabServer
 from wasm_host import Host, options_of
 
 TRAIN = """async ([threads, points, colors, views, settings]) => {

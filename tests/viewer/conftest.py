@@ -134,7 +134,7 @@ def edit_page(visit, tmp_path):
     def make(gaussians, cameras=(), width=900, height=700, *, origin=(0.0, 0.0, 0.0), tour=None, **options):
         """Other options are those of `visit`."""
         settings = RenderSettings(jacobian_limit=1.3, depth=False)
-        source = Source(tmp_path / "scene.ply", Scene(gaussians, origin=origin), cameras, settings)
+        source = Source(tmp_path / "scene.ply", Scene(gaussians, origin=origin), tuple(cameras), settings)
         write_scene(tmp_path / "scene.ply", source.scene)
         editing = editing_of(source, tmp_path / "scene.ply", tmp_path / "edits.json")
         html = page.html(source.scene, cameras, source.settings, "scene", (), tour, editing)

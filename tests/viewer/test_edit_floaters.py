@@ -223,6 +223,16 @@ def test_a_range_of_the_bar_chart_is_selected_by_keys_and_by_dragging(opened):
     ].tolist() == [N + 1]
 
 
+def test_the_bar_chart_is_as_sharp_as_its_panel_is_wide_in_a_window_that_keeps_its_size(opened):
+    shown = opened()
+    shown.tab.click("#edit-histogram summary")
+    chart(shown)
+    before = shown.evaluate("element('edit-chart').width")
+    shown.evaluate("element('edit-column').style.width = '14rem'")  # as beside a scroll bar
+    until(shown.tab, f"element('edit-chart').width < {before}")
+    assert shown.evaluate("element('edit-chart').width === element('edit-chart').clientWidth")
+
+
 def test_the_selection_grows_and_shrinks_by_keys(opened):
     shown = opened()
     assert float(shown.tab.input_value("#edit-near")) == pytest.approx(0.3)

@@ -172,7 +172,7 @@ def _gaps(names: Sequence[str], shared: Mapping[tuple[int, int], Shared]) -> lis
     where = counted(len(gaps), "place")
     what = f"{where} where a photo shares too little with the next one, first {first} with {next_one}"
     advice = (
-        "nothing, if other photos show what both show; otherwise take two or three photos between them, each sharing"
+        "leave it if other photos show what both show; otherwise take two or three photos between them, each sharing"
         " most of its view with the next, because photos that share nothing with the others cannot be placed"
     )
     images = tuple(names[i] for i in gaps)
@@ -193,7 +193,7 @@ def _jumps(names: Sequence[str], shared: Mapping[tuple[int, int], Shared]) -> li
     images, stops = tuple(names[i] for i in jumping), tuple(f"{light[i]:+.1f}" for i in jumping)
     what = f"{len(images)} of {len(names)} photos are brighter or darker than those before and after them, in stops"
     advice = (
-        "nothing, if the light stayed the same: a training evens exposures out. Next time, lock the exposure while you"
-        " take photos"
+        "leave them if the light stayed the same: a training evens exposures out. Next time, lock the exposure while"
+        " you take photos"
     )
     return [Finding("brightness", Severity.NOTE, what, advice, images, stops)]

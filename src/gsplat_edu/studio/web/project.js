@@ -108,7 +108,7 @@ function onward(step) {
 export function nextStep(store, of = "") {
   const line = errorLine();
   const place = h("div", { class: "row" });
-  const note = want("span", { class: "quiet" }, "The next step comes when the job has ended.");
+  const note = want("span", { class: "quiet" }, "The next step comes when this one has ended.");
   const element = h("div", { class: "next-step" }, place, line);
   let shown = "";
 

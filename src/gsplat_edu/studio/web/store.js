@@ -129,7 +129,8 @@ export class Store extends EventTarget {
 
   // The capture of a run: what the studio says it was made from, under its present name.
   captureOf(run) {
-    const [kind, name] = run.made_from?.split("/") ?? [];
+    const from = run.made_from ?? this.jobsOf(run.entry, "train")[0]?.job.work.inputs[0]; // its folder may come later
+    const [kind, name] = from?.split("/") ?? [];
     if (kind === "captures") return this.entry(kind, name);
     return run.capture ? this.entryAt(run.capture) : null;
   }

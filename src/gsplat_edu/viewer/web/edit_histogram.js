@@ -1,6 +1,6 @@
 // The editor's bar chart of opacities, sizes or distances, on which a range of splats is selected.
 
-import { element } from "./common.js";
+import { element, followSize } from "./common.js";
 import { SELECTED } from "./edit_flags.js";
 import { shortNumber } from "./edit_shapes.js";
 
@@ -92,7 +92,7 @@ export class EditHistogram {
     this.canvas.addEventListener("pointermove", (event) => this.drag(event));
     for (const name of ["pointerup", "pointercancel"]) this.canvas.addEventListener(name, () => (this.held = null));
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.changed());
-    addEventListener("resize", () => this.changed());
+    followSize(this.canvas, () => this.changed());
   }
 
   get quantity() {

@@ -7,8 +7,8 @@ export const whole = (number) => Math.round(number).toLocaleString("en");
 export function bytes(number) {
   const units = ["B", "kB", "MB", "GB", "TB"];
   let [value, unit] = [number, 0];
-  while (value >= 1000 && unit < units.length - 1) [value, unit] = [value / 1000, unit + 1];
-  return `${unit && value < 100 ? value.toPrecision(2) : Math.round(value)} ${units[unit]}`;
+  while (Math.round(value) >= 1000 && unit < units.length - 1) [value, unit] = [value / 1000, unit + 1];
+  return `${unit && Math.round(value) < 100 ? value.toPrecision(2) : Math.round(value)} ${units[unit]}`;
 }
 
 export function duration(seconds) {
