@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from gsplat_edu.base.styles import tokens_by_theme
+from gsplat_edu.tab.serving import write_page
 from site_figures import with_figures
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -403,6 +404,7 @@ def main() -> int:
                 "build_site.py: the site was not written; the lines above name the problems", file=sys.stderr
             )
             return 1
+        write_page(made / "train")
         if out.exists():
             shutil.rmtree(out)
         out.parent.mkdir(parents=True, exist_ok=True)

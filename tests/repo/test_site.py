@@ -16,6 +16,7 @@ import pytest
 
 from build_site import built_from
 from chapters import SOURCES
+from gsplat_edu.tab.serving import PAGE, POLICY, page_files
 from tiers import SOAK
 from waiting import until, until_in
 
@@ -109,6 +110,16 @@ def test_every_chapter_document_and_module_has_a_page(site):
     course = [pages[path] for path in chapters_of(out)]
     assert all("img" in page.tags for page in course), "the page has figures"
     assert sum("math" in page.tags for page in course) > 5, "the page has equations"
+
+
+@pytest.mark.slow
+def test_the_site_has_the_page_that_trains_in_a_tab(site):
+    """With its policy in the page, since the site has no server of ours, and all files that the server has."""
+    _, out = site
+    assert "train/index.html" in (out / "index.html").read_text()
+    files = page_files().keys() - {PAGE}
+    assert all((out / "train" / address.removeprefix("/")).is_file() for address in files)
+    assert f'content="{POLICY}"' in (out / "train" / "index.html").read_text()
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_the_page_names_the_shared_modules_at_once():
     shared = {
         line.split("../../")[1].rstrip('";') for line in imported.splitlines() if 'from "../../' in line
     }
-    assert len(shared) == 3 and all(f'<link rel="modulepreload" href="/{name}">' in page for name in shared)
+    assert len(shared) == 3 and all(f'<link rel="modulepreload" href="{name}">' in page for name in shared)
 
 
 @pytest.mark.parametrize("missing", MODULES)

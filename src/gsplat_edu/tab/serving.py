@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 from starlette.datastructures import MutableHeaders
@@ -37,6 +38,9 @@ POLICY = "; ".join(
 )
 """Content-Security-Policy: scripts, styles and data of this server only."""
 
+PAGE = "/tab/web/index.html"
+"""Address of the page's file, which is served at `/`: its links begin there."""
+
 EMBEDDER = "Cross-Origin-Embedder-Policy"
 """Header that a browser needs to let a page share memory between threads, beside those of `gsplat_edu.server.guard`."""
 
@@ -55,7 +59,7 @@ class TabServer(PageServer):
     def __init__(self, host: str = LOOPBACK, port: int = 0) -> None:
         found = page_files()
         super().__init__(POLICY, host, port)
-        self.page = found["/tab/web/index.html"].read_bytes()
+        self.page = found[PAGE].read_bytes()
         self.served = found
 
     def application(self) -> ASGIApp:
@@ -71,6 +75,25 @@ class TabServer(PageServer):
             await inner(scope, receive, sending)
 
         return isolated
+
+
+def write_page(folder: Path) -> None:
+    """Write the page and its files, for a server that only has files. There it trains on one thread.
+
+    Args:
+        folder: A new folder.
+
+    Raises:
+        ArgumentError: a module is not built.
+    """
+    files = page_files()
+    page = files.pop(PAGE).read_text("utf-8")
+    for address, path in files.items():
+        copy = folder / address.removeprefix("/")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    (folder / "index.html").write_text(page.replace("<head>", f"<head>\n{policy}", 1), "utf-8")
 
 
 def page_files(package: Path = PACKAGE) -> dict[str, Path]:

@@ -4,7 +4,7 @@ import { filesOf } from "../../viewer/web/dropped.js";
 import { h, keepPresses, patch, want } from "../../viewer/web/patch.js";
 import { bytes, count, duration, whole } from "../../viewer/web/words.js";
 
-const EXAMPLE = { url: "/example.zip", name: "Garden" };
+const EXAMPLE = { url: "example.zip", name: "Garden" };
 const LENGTHS = { draft: "Draft", standard: "Standard", high: "High" };
 const SIZES = { 480: "480 px", 800: "800 px", 1200: "1200 px" };
 const PHONE = { most: 40_000, longest: 480, quality: "draft" };
