@@ -1,5 +1,6 @@
 """The server of the page, and its command."""
 
+import re
 import shutil
 import urllib.error
 import urllib.request
@@ -7,7 +8,17 @@ import urllib.request
 import pytest
 
 from gsplat_edu.base.errors import ArgumentError
-from gsplat_edu.tab.serving import EXAMPLE, MODULES, PACKAGE, ROOMS, TabServer, page_files
+from gsplat_edu.tab.serving import (
+    EXAMPLE,
+    MODULES,
+    PACKAGE,
+    PAGE,
+    POLICY,
+    ROOMS,
+    TabServer,
+    page_files,
+    write_page,
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +83,14 @@ def test_without_a_module_one_line_says_how_to_build_it(node, tmp_path, missing)
         )
     with pytest.raises(ArgumentError, match=f"{missing}: is not built; run python tools/build_wasm.py"):
         page_files(tmp_path)
+
+
+def test_the_page_is_written_for_any_folder_of_a_server(node, tmp_path):
+    """Its links begin at the page, wherever that is; the policy stands in the page."""
+    write_page(tmp_path)
+    written = {f"/{path.relative_to(tmp_path).as_posix()}" for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == page_files().keys() - {PAGE} | {"/index.html"}
+    assert f'content="{POLICY}"' in (tmp_path / "index.html").read_text("utf-8")
+    texts = [path.read_text("utf-8") for path in (tmp_path / "tab").rglob("*.js")]
+    texts.append((tmp_path / "index.html").read_text("utf-8"))
+    assert not [text for text in texts if re.search(r"[\"'`]/(base|tab|viewer|example)", text)]

@@ -22,7 +22,7 @@ const worker = new Worker(new URL("./worker.js", import.meta.url), { type: "modu
 const tell = (message) => worker.postMessage(message);
 
 const icon = (name) =>
-  want("svg", { class: "icon", "aria-hidden": "true" }, want("use", { href: `/base/web/icons.svg#icon-${name}` }));
+  want("svg", { class: "icon", "aria-hidden": "true" }, want("use", { href: `base/web/icons.svg#icon-${name}` }));
 
 const button = (text, onclick, more = {}, ...inside) =>
   want("button", { type: "button", onclick, ...more }, ...inside, text);
