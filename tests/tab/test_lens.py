@@ -5,7 +5,7 @@ import pytest
 
 from gsplat_edu.data.lens import lens_of
 from gsplat_edu.data.lens_formulas import FORMULAS, PERSPECTIVE
-from tab.in_node import answer
+from modules_in_node import answer
 
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 

@@ -15,7 +15,7 @@ from gsplat_edu.io.ply import save_ply
 from gsplat_edu.scene.gaussians import Gaussians
 from gsplat_edu.scene.rig import point_nearest_axes, scene_extent
 from gsplat_edu.train.length import QUALITIES, planned_iterations
-from tab.in_node import answer
+from modules_in_node import answer
 
 NAMES = ("means", "quats", "log_scales", "sh0", "sh_rest", "logit_opacities")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-WEB = Path(__file__).parents[2] / "src" / "gsplat_edu" / "tab" / "web"
+WEB = Path(__file__).parents[1] / "src" / "gsplat_edu" / "tab" / "web"
 
 PROGRAM = """
 import {{ readFileSync }} from "node:fs";
