@@ -27,6 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tools"))
 
+import build_wasm  # noqa: E402
 from wheels.checks import problems  # noqa: E402
 from wheels.contents import nanobind_parts, zig_parts  # noqa: E402
 from wheels.pack import pack  # noqa: E402
@@ -87,7 +88,16 @@ def run(words: list[object], log: Path, cwd: Path = ROOT) -> None:
 
 
 def pure_wheel(build: Path) -> Path:
-    """Make the wheel of the package without its module, by the project's build backend."""
+    """Make the wheel of the package without its native module, by the project's build backend.
+
+    Raises:
+        NotBuiltError: zig does not compile the modules for browsers, which the wheel contains.
+    """
+    if not build_wasm.is_built():
+        try:
+            build_wasm.build()
+        except build_wasm.NotBuiltError as error:
+            raise NotBuiltError(str(error)) from error
     folder = build / "pure"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)

@@ -39,7 +39,7 @@ def nanobind_parts() -> list[dict[str, str]]:
 
 
 def zig_parts(windows: bool) -> list[dict[str, str]]:
-    """Describe the libraries that zig links into a module: the C++ library, and on Windows the C runtime's start."""
+    """Describe what zig links: the C++ library, on Windows the C runtime's start, and WebAssembly's C library."""
     import ziglang
 
     folder = Path(ziglang.__file__).parent
@@ -47,6 +47,8 @@ def zig_parts(windows: bool) -> list[dict[str, str]]:
     llvm = "Apache-2.0 WITH LLVM-exception"
     parts = [("libcxx", llvm, "lib/libcxx/LICENSE.TXT"), ("libunwind", llvm, "lib/libunwind/LICENSE.TXT")]
     parts.append(("zig-compiler-rt", "MIT", "LICENSE"))
+    parts.append(("wasi-libc", "MIT", "lib/libc/wasi/LICENSE-MIT"))
+    parts.append(("musl", "MIT", "lib/libc/musl/COPYRIGHT"))  # most of wasi-libc
     if windows:
         parts.append(("mingw-w64", "ZPL-2.1", "lib/libc/mingw/COPYING"))
     return [
