@@ -2,9 +2,9 @@
 
     python tools/generate_recipe.py
 
-They come from `gsplat_edu.train`. It writes wasm/recipe.h, a structure whose numbers have the order of `FIELDS`, and
-src/gsplat_edu/tab/web/recipe.js, their values for 30,000 iterations and which of them scale with the length of a run. A
-test compares the files with this script's output.
+They come from `gsplat_edu.train` and constants. It writes wasm/recipe.h, a structure whose numbers have the order of
+`FIELDS`, and src/gsplat_edu/tab/web/recipe.js, their values for 30,000 iterations and which of them scale with the
+length of a run. A test compares the files with this script's output.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from gsplat_edu.base import constants
 from gsplat_edu.train.capacity import LEAST_PLANNED, PLANNED, PLANNED_PIXELS, PLANNED_VIEWS, SEPARATE
 from gsplat_edu.train.config import (
     FAST_DENSIFICATIONS,
@@ -94,9 +95,13 @@ def module() -> str:
         "PLANNED_VIEWS": PLANNED_VIEWS,
         "LEAST_PLANNED": LEAST_PLANNED,
         "SEPARATE": SEPARATE,
+        "Z_NEAR": constants.Z_NEAR,
+        "DILATION": constants.DILATION,
+        "ALPHA_MAX": constants.ALPHA_MAX,
+        "C0": constants.C0,
     }
     lines = [
-        "// Made by tools/generate_recipe.py from src/gsplat_edu/train. Do not edit.",
+        "// Made by tools/generate_recipe.py from src/gsplat_edu/train and base/constants.py. Do not edit.",
         "",
         *(f"export const {name} = {_written(value)};" for name, value in numbers.items()),
         "",

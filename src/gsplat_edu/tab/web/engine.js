@@ -2,7 +2,9 @@
 // page, in a worker and in node.
 
 import {
+  ALPHA_MAX,
   DENSIFY_EVERY,
+  DILATION,
   FAST_DENSIFICATIONS,
   LEAST_PLANNED,
   MILESTONES,
@@ -12,6 +14,7 @@ import {
   RECIPE,
   RECIPE_ITERATIONS,
   SEPARATE,
+  Z_NEAR,
 } from "./recipe.js";
 
 const PAGE = 1 << 16; // bytes
@@ -215,12 +218,12 @@ function bound(size, middle, focal, limit) {
 
 function settingNumbers(settings = {}) {
   const {
-    zNear = 0.05,
+    zNear = Z_NEAR,
     background = [0, 0, 0],
     shDegree = 3,
     antialiased = false,
-    dilation = 0.3,
-    alphaMax = 0.99,
+    dilation = DILATION,
+    alphaMax = ALPHA_MAX,
   } = settings;
   return Float64Array.from([
     zNear,

@@ -1,4 +1,4 @@
-// One thread of the WebAssembly module: an instance with the memory of the first one, which takes part in its rounds for ever.
+// One thread of the WebAssembly module: an instance that shares the memory of the first one, and helps whenever that computes.
 
 import { importsOf } from "./engine.js";
 

@@ -1,6 +1,8 @@
 // Start points: from a PLY, or random ones where photos overlap.
 
+import { sceneExtent } from "./engine.js";
 import { Bytes, CaptureError } from "./reading.js";
+import { C0 } from "./recipe.js";
 
 const READ = {
   char: "i8",
@@ -22,7 +24,6 @@ const READ = {
 };
 const SIZES = { i8: 1, u8: 1, i16: 2, u16: 2, i32: 4, u32: 4, f32: 4, f64: 8 };
 const FULL = { u8: 255, u16: 65535 }; // full brightness of integer colours
-const C0 = 0.28209479177387814; // the constant harmonic
 const HEADER = 1 << 16;
 
 export const RANDOM_POINTS = 50_000;
@@ -167,8 +168,7 @@ export function randomPoints(cameras, seed = 0, most = RANDOM_POINTS) {
 // The distance to what most cameras look at, but at least the extent of the cameras.
 function sizeOf(cameras) {
   const mean = [0, 1, 2].map((c) => cameras.reduce((sum, { eye }) => sum + eye[c], 0) / cameras.length);
-  const spread = Math.max(...cameras.map(({ eye }) => Math.hypot(...eye.map((value, c) => value - mean[c]))));
-  const extent = 1.1 * spread || 1;
+  const extent = sceneExtent(cameras);
   const focus = nearestToAxes(cameras, mean);
   if (!focus) return extent;
   const depths = cameras.map((camera) => toCamera(camera, focus)[2]).sort((a, b) => a - b);

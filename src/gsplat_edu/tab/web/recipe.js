@@ -1,4 +1,4 @@
-// Made by tools/generate_recipe.py from src/gsplat_edu/train. Do not edit.
+// Made by tools/generate_recipe.py from src/gsplat_edu/train and base/constants.py. Do not edit.
 
 export const RECIPE_ITERATIONS = 30000;
 export const FAST_DENSIFICATIONS = 20;
@@ -8,6 +8,10 @@ export const PLANNED_PIXELS = 734580;
 export const PLANNED_VIEWS = 85;
 export const LEAST_PLANNED = 1000;
 export const SEPARATE = 2.0;
+export const Z_NEAR = 0.05;
+export const DILATION = 0.3;
+export const ALPHA_MAX = 0.99;
+export const C0 = 0.28209479177387814;
 
 // The settings of the recipe fast for RECIPE_ITERATIONS, in the order in which the module reads them.
 export const RECIPE = {

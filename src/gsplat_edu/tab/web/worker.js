@@ -172,7 +172,7 @@ function opaque(rgb, full) {
   return out;
 }
 
-// Writes into the browser's storage; without room there, the training goes on and says so.
+// Writes into the browser's storage. If it has no room, the training goes on and the page says so.
 async function kept(act) {
   try {
     await act();
